@@ -37,7 +37,6 @@ from fhash_formats.writers.common import (
     Region,
     coordinate_attributes,
     safe_name,
-    unused_name,
     variable_attributes,
 )
 
@@ -142,7 +141,7 @@ class ZarrView:
         scales = []
         used = {"": {LEVELS, DOCUMENT}}
         for key, volume in volumes.items():
-            self.names[key] = unused_name(volume.name or key, used[""])
+            self.names[key] = safe_name(volume.name or key, used[""])
         self._shown = {LEVELS, DOCUMENT, *self.names.values()}
         for key, volume in volumes.items():
             name = self.names[key]

@@ -6,19 +6,26 @@ import base64
 import math
 import re
 import struct
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, Coordinate, Series, SourceMetadata, SourceVariable
+from fhash_formats.series import (
+    AXES,
+    AXIS_NAMES,
+    Coordinate,
+    Series,
+    SourceMetadata,
+    SourceVariable,
+)
 from fhash_formats.support.dates import (
     CALENDARS,
     MONTH_UNITS,
@@ -39,11 +46,8 @@ AS_STORED = "; --raw-values reads the numbers as they are stored"
 
 @dataclass(frozen=True, kw_only=True)
 class Packing:
-    """The packing of an array.
-
-    It has the stored type, the type of the values, the fill values, the scale and the offset (None:
-    none).
-    """
+    """The packing of an array: its stored type, the type of its values, its fill values, and the
+    scale and the offset (None: none)."""
 
     stored: np.dtype[Any]
     dtype: np.dtype[Any]
@@ -63,21 +67,16 @@ class Packing:
 
     def unpack(self, stored: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Physical values of stored ones; the same array where nothing is packed."""
-        numbers = stored.astype(stored.dtype.newbyteorder("="), copy=False).view(
-            self.stored
-        )  # the view is for _Unsigned
-        if self.dtype == self.stored:
-            # floats without scaling; the array is fresh and may be changed in place
-            for fill in self.fills:
-                numbers[numbers == fill] = np.nan
-            return numbers
-        values = numbers.astype(self.dtype)
+        # the view is for _Unsigned; the array is fresh and may be changed in place
+        numbers = stored.astype(stored.dtype.newbyteorder("="), copy=False).view(self.stored)
+        missing = [numbers == fill for fill in self.fills]
+        values = numbers.astype(self.dtype, copy=False)
         if self.scale is not None:
             values *= self.scale
         if self.offset is not None:
             values += self.offset
-        for fill in self.fills:
-            values[numbers == fill] = np.nan
+        for each in missing:
+            values[each] = np.nan
         return values
 
 
@@ -90,21 +89,20 @@ def packing(
     own metadata. Raises InputError for an attribute that is not a number.
     """
     stored = dtype.newbyteorder("=")
-    signs = {"true": ("i", "u"), "false": ("u", "i")}.get(
-        text_of(_single(attributes.get("_Unsigned", ""))).lower()
-    )
-    other = signs is not None and stored.kind == signs[0]
-    if signs is not None and other:
+    told = text_of(_single(attributes.get("_Unsigned", ""))).lower()
+    signs = {"true": "iu", "false": "ui"}.get(told, "--")
+    other = stored.kind == signs[0]
+    if other:
         stored = np.dtype(f"{signs[1]}{stored.itemsize}")
-    fills = []
-    for value in (fill_value, *(attributes.get(name) for name in ("_FillValue", "missing_value"))):
-        for each in value if isinstance(value, list | tuple | np.ndarray) else [value]:
-            if each is not None:
-                fills.append(_fill(source, each, stored, unsigned=other and stored.kind == "i"))
+    values: list[Any] = []
+    for value in (fill_value, attributes.get("_FillValue"), attributes.get("missing_value")):
+        values += value if isinstance(value, list | tuple | np.ndarray) else [value]
+    unsigned = other and stored.kind == "i"
+    fills = [_fill(source, each, stored, unsigned=unsigned) for each in values if each is not None]
     scale, offset = (_single(attributes.get(name)) for name in ("scale_factor", "add_offset"))
     return _packing(
         stored,
-        [fill for fill in fills if fill is not None and fill == fill],  # NaN marks itself
+        fills,
         _number(source, "scale_factor", scale),
         _number(source, "add_offset", offset),
         _scaled_type(stored, scale, offset),
@@ -128,25 +126,24 @@ def missing_values(source: str, dtype: np.dtype[Any], values: Sequence[float]) -
     values: they occur nowhere if the type cannot hold them.
     """
     stored = dtype.newbyteorder("=")
-    fills = [_fill(source, value, stored) for value in values]
-    return _packing(
-        stored, [fill for fill in fills if fill is not None and fill == fill], None, None, stored
-    )
+    return _packing(stored, [_fill(source, value, stored) for value in values])
 
 
 def _packing(
     stored: np.dtype[Any],
     fills: Sequence[Any],
-    scale: float | None,
-    offset: float | None,
-    scaled: np.dtype[Any],
+    scale: float | None = None,
+    offset: float | None = None,
+    scaled: np.dtype[Any] | None = None,
 ) -> Packing:
+    """A packing without fills that are nowhere (None), or mark themselves (NaN)."""
+    kept = tuple(fill for fill in fills if fill is not None and fill == fill)
     dtype = stored
-    if scale is not None or offset is not None:
+    if scaled is not None and (scale is not None or offset is not None):
         dtype = scaled
-    elif fills and stored.kind in "iu":
+    elif kept and stored.kind in "iu":
         dtype = np.dtype(np.float32 if stored.itemsize <= 2 else np.float64)
-    return Packing(stored=stored, dtype=dtype, fills=tuple(fills), scale=scale, offset=offset)
+    return Packing(stored=stored, dtype=dtype, fills=kept, scale=scale, offset=offset)
 
 
 def _scaled_type(stored: np.dtype[Any], scale: Any, offset: Any) -> np.dtype[Any]:
@@ -155,13 +152,11 @@ def _scaled_type(stored: np.dtype[Any], scale: Any, offset: Any) -> np.dtype[Any
     An offset alone, or of another type than the scale, is not CF and needs float64; so do integers
     of 32 bits with both.
     """
-    double = np.dtype(np.float64)
-    if not isinstance(scale, np.floating) or (
-        offset is not None and type(offset) is not type(scale)
-    ):
-        return double
     wide = offset is not None and stored.kind in "iu" and stored.itemsize == 4
-    return double if wide or scale.dtype.itemsize > 8 else scale.dtype
+    if not isinstance(scale, np.floating) or scale.dtype.itemsize > 8 or wide:
+        return np.dtype(np.float64)
+    alike = offset is None or type(offset) is type(scale)
+    return scale.dtype if alike else np.dtype(np.float64)
 
 
 def _single(value: Any) -> Any:
@@ -190,9 +185,9 @@ def _fill(source: str, value: Any, stored: np.dtype[Any], *, unsigned: bool = Fa
     unsigned: whether the value was written for unsigned numbers that are read as signed.
     """
     if isinstance(value, str | bytes):
-        text = text_of(value)
-        number = number_of_text(text)
-        value = text if number is None else number
+        value = text_of(value)
+        number = number_of_text(value)
+        value = value if number is None else number
     if not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(f"{source}: the fill value {value!r} is not a number{AS_STORED}")
     if stored.kind == "f":
@@ -200,14 +195,11 @@ def _fill(source: str, value: Any, stored: np.dtype[Any], *, unsigned: bool = Fa
             return stored.type(value)
     if not math.isfinite(value) or value != int(value):
         return None
-    integer = int(value)
-    limits = np.iinfo(stored)
-    if integer < 0 and stored.kind == "u":
-        integer += 2 ** (
-            8 * stored.itemsize
-        )  # the fill value of an _Unsigned array is written signed
+    integer, limits = int(value), np.iinfo(stored)
+    if integer < 0 and stored.kind == "u":  # that of an _Unsigned array is written signed
+        integer += 1 << limits.bits
     if unsigned and integer > limits.max:
-        integer -= 2 ** (8 * stored.itemsize)
+        integer -= 1 << limits.bits
     return stored.type(integer) if limits.min <= integer <= limits.max else None
 
 
@@ -234,44 +226,25 @@ x1v, x2v, x3v are Athena++'s, bottom_top and the like WRF's.
 
 ROLE_OF_NAME = {name: axis for axis, names in NAMES.items() for name in names.split()}
 
-AXIS_STANDARD_NAMES = (
-    ("t", re.compile(r"time|forecast_reference_time|forecast_period")),
-    (
-        "z",
-        re.compile(
-            r"(atmosphere|ocean)_.*_coordinate|height.*|altitude|depth.*|air_pressure"
-            r"|model_level_number|.*_sigma_.*"
-        ),
-    ),
-    (
-        "y",
-        re.compile(
-            r"latitude|grid_latitude|projection_y_coordinate|projection_y_angular_coordinate"
-        ),
-    ),
-    (
-        "x",
-        re.compile(
-            r"longitude|grid_longitude|projection_x_coordinate|projection_x_angular_coordinate"
-        ),
-    ),
-)
-AXIS_UNITS = (
-    ("t", re.compile(r"\S+ since \S.*")),
-    (
-        "z",
-        re.compile(
-            r"(pascal|pa|hpa|kpa|bar|millibar|mbar|mb|dbar|decibar|atm|layer|level|sigma_level)s?"
-        ),
-    ),
-    ("y", re.compile(r"degrees?_?n(orth)?")),
-    ("x", re.compile(r"degrees?_?e(ast)?")),
-)
+AXIS_PATTERNS = {
+    "standard_name": {
+        "t": r"time|forecast_reference_time|forecast_period",
+        "z": r"(atmosphere|ocean)_.*_coordinate|height.*|altitude|depth.*|air_pressure"
+        r"|model_level_number|.*_sigma_.*",
+        "y": r"(grid_)?latitude|projection_y_(angular_)?coordinate",
+        "x": r"(grid_)?longitude|projection_x_(angular_)?coordinate",
+    },
+    "units": {
+        "t": r"\S+ since \S.*",
+        "z": r"(pascal|pa|hpa|kpa|bar|millibar|mbar|mb|dbar|decibar|atm|layer|level|sigma_level)s?",
+        "y": r"degrees?_?n(orth)?",
+        "x": r"degrees?_?e(ast)?",
+    },
+}
 
 
 def role_of_name(name: str) -> str | None:
-    """The axis of a conventional name in any case, also with a trailing number ("time_0"), or
-    None."""
+    """The axis of a conventional name in any case, or with a trailing number: "time_0"; or None."""
     word = name.lower()
     return ROLE_OF_NAME.get(word) or ROLE_OF_NAME.get(re.sub(r"(?<=..)_?\d+$", "", word))
 
@@ -284,59 +257,14 @@ def role_of_coordinate(name: str, attributes: Mapping[str, Any]) -> str | None:
     axis = str(attributes.get("axis", "")).lower()
     if axis in AXES:
         return axis
-    for key, table in (("standard_name", AXIS_STANDARD_NAMES), ("units", AXIS_UNITS)):
+    for key, patterns in AXIS_PATTERNS.items():
         text = str(attributes.get(key, "")).strip().lower()
-        for role, pattern in table:
-            if pattern.fullmatch(text):
+        for role, pattern in patterns.items():
+            if re.fullmatch(pattern, text):
                 return role
     if str(attributes.get("positive", "")).lower() in ("up", "down"):
         return "z"
     return role_of_name(name)
-
-
-def assign_axes(
-    what: str,
-    shape: Sequence[int],
-    hints: Sequence[str | None],
-    names: Sequence[str | None],
-    axes: tuple[str, ...] | None,
-) -> tuple[str, ...]:
-    """The axis of each of 3 or 4 dimensions.
-
-    `axes`, if the user gave it, decides. Otherwise the hints do. Dimensions without a hint take the
-    axes that are left in the order (t, z, y, x). 3 dimensions are (z, y, x) unless a hint says
-    time; then they are (t, y, x) first of all.
-
-    Raises InputError where that is ambiguous: two dimensions with one meaning, or an order that
-    cannot be completed with certainty.
-    """
-    if axes is not None:
-        if len(axes) != len(shape):
-            raise InputError(
-                f"{what}: --axes {','.join(axes)} names {len(axes)} axes, the array has"
-                f" {len(shape)} dimensions {tuple(shape)}"
-            )
-        return axes
-    said = [hint for hint in hints if hint is not None]
-    shown = ", ".join(f"{name or '?'}={length}" for name, length in zip(names, shape, strict=True))
-    if len(set(said)) != len(said):
-        raise InputError(
-            f"{what}: two dimensions of ({shown}) mean the same axis; say what they are with"
-            " --axes, such as t,z,y,x"
-        )
-    open_places = len(shape) - len(said)
-    if open_places > 1 and said != sorted(said, key=AXES.index):
-        raise InputError(
-            f"{what}: the order of the dimensions ({shown}) is not clear; say what they are with"
-            " --axes, such as x,y,z,t"
-        )
-    left = [axis for axis in (AXES if len(shape) == len(AXES) else AXES[1:]) if axis not in said]
-    fill = iter(left[len(left) - open_places :])
-    return tuple(hint if hint is not None else next(fill) for hint in hints)
-
-
-TIME_NAMES = ("time", "forecast_period", "forecast_reference_time")
-"""Standard names of CF for coordinates that count time."""
 
 
 NUMBERED = "step numbers stand for the times"
@@ -347,23 +275,24 @@ LOSS = Fraction(1, 10**6)
 Parts = Sequence[tuple[Path, Coordinate]]
 
 
-class Described(Protocol):
-    """A stored array that may be a coordinate: its full name, attributes and values."""
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """A stored 1-D array (or scalar, length 1) that may be a coordinate.
+
+    `read` gives its values. A column that is not `numeric` holds labels, such as the names of
+    members.
+    """
+
+    name: str
+    length: int
+    read: Callable[[], npt.NDArray[Any]]
+    attributes: Mapping[str, Any]
+    numeric: bool = True
 
     @property
-    def name(self) -> str:
-        """Full name."""
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """Attributes as the library gives them."""
-
-    @property
-    def read(self) -> Callable[[], npt.NDArray[Any]]:
-        """Function that reads the values."""
-
-
-Kind = TypeVar("Kind", bound=Described)
+    def described(self) -> tuple[str, Mapping[str, Any], np.dtype[Any]]:
+        """Its name without groups, its attributes and its type."""
+        return self.name.rpartition("/")[2], self.attributes, self.read().dtype
 
 
 def is_time(name: str, attributes: Mapping[str, Any], dtype: np.dtype[Any]) -> bool:
@@ -371,25 +300,24 @@ def is_time(name: str, attributes: Mapping[str, Any], dtype: np.dtype[Any]) -> b
     units = str(attributes.get("units", "")).strip()
     if dtype.kind == "M" or SINCE.fullmatch(units) or units.lower() in UNITS:
         return True
-    return str(attributes.get("standard_name", "")).strip().lower() in TIME_NAMES
+    name = str(attributes.get("standard_name", "")).strip().lower()
+    return name in ("time", "forecast_period", "forecast_reference_time")
 
 
 def counts_steps(values: npt.NDArray[Any]) -> bool:
     """Whether values are whole numbers that rise by 1 from 0 or 1: numbers of steps."""
-    if values.dtype.kind not in "iuf" or not values.size:
-        return False
     numbers = values.ravel()
-    return bool(
-        numbers[0] in (0, 1) and np.array_equal(numbers, numbers[0] + np.arange(numbers.size))
-    )
+    if values.dtype.kind not in "iuf" or not numbers.size or numbers[0] not in (0, 1):
+        return False
+    return np.array_equal(numbers, numbers[0] + np.arange(numbers.size))
 
 
-def only_counts(column: Described) -> bool:
+def only_counts(column: Column) -> bool:
     """Whether a coordinate of time only counts the steps."""
-    return not is_time(*_description(column)) and counts_steps(column.read())
+    return not is_time(*column.described) and counts_steps(column.read())
 
 
-def real_time(named: Kind | None, others: Iterable[Kind]) -> Kind | None:
+def real_time(named: Column | None, others: Iterable[Column]) -> Column | None:
     """The coordinate of the time dimension: its namesake, unless that only counts its steps.
 
     Args:
@@ -397,18 +325,16 @@ def real_time(named: Kind | None, others: Iterable[Kind]) -> Kind | None:
         others: further coordinates along the dimension. One that counts time comes before numbers
             of steps and before none: dates first, then other units of time, then a name of time.
     """
-    if named is not None and is_time(*_description(named)):
-        return named
-    if named is not None and not counts_steps(named.read()):
+    if named is not None and not only_counts(named):
         return named
     ranked = [(_rank(column), number, column) for number, column in enumerate(others)]
     found = sorted((each for each in ranked if each[0] is not None), key=lambda each: each[:2])
     return found[0][2] if found else named
 
 
-def _rank(column: Described) -> int | None:
+def _rank(column: Column) -> int | None:
     """Place among coordinates of time, the first is best; None for one that is no time."""
-    name, attributes, dtype = _description(column)
+    name, attributes, dtype = column.described
     if dtype.kind == "M" or SINCE.fullmatch(str(attributes.get("units", ""))):
         # the start of a forecast is the same for all of its steps
         return 3 if attributes.get("standard_name") == "forecast_reference_time" else 0
@@ -416,10 +342,6 @@ def _rank(column: Described) -> int | None:
     if is_time(name, attributes, dtype):
         return 1 if known else None
     return 2 if known and not counts_steps(column.read()) else None
-
-
-def _description(column: Described) -> tuple[str, Mapping[str, Any], np.dtype[Any]]:
-    return column.name.rpartition("/")[2], column.attributes, column.read().dtype
 
 
 def settled(coordinate: Coordinate) -> tuple[Coordinate, str]:
@@ -446,11 +368,6 @@ def settled(coordinate: Coordinate) -> tuple[Coordinate, str]:
     told = f"{name} counts '{units}'; it is read as {how}, and given in {found[1]['units']}"
     values = np.array(found[0], np.float64)
     return replace(coordinate, values=values, attributes={**attributes, **found[1]}), told
-
-
-def is_numbered(remark: str) -> bool:
-    """Whether the numbers of steps stand for times of which something is said."""
-    return remark.endswith(NUMBERED)
 
 
 def with_times(metadata: SourceMetadata, time: Coordinate) -> SourceMetadata:
@@ -483,10 +400,8 @@ def with_times(metadata: SourceMetadata, time: Coordinate) -> SourceMetadata:
     return replace(metadata, variables=tuple(variables))
 
 
-def texts_along(
-    dimension: str | None, length: int, arrays: Iterable[Any]
-) -> Iterator[tuple[npt.NDArray[Any], Mapping[str, Any]]]:
-    """Texts along a dimension, or letters: the texts of each array, and its attributes.
+def written_times(dimension: str | None, length: int, arrays: Iterable[Any]) -> Coordinate | None:
+    """The times that texts along a dimension, or letters, give; None without such.
 
     dimension: its name; None for one without, along which arrays with a name of times may lie.
     arrays: Variables.
@@ -497,26 +412,16 @@ def texts_along(
         along, name = array.dimensions[0], array.name.rpartition("/")[2].lower()
         texts = len(array.shape) == 1 and array.dtype.kind in "SUTO"
         fits = along == dimension if along is not None else name in NAMES["t"].split()
-        if (array.is_letters or texts) and fits:
-            yield array.texts(), array.attributes
-
-
-def written_times(
-    dimension: str, columns: Iterable[tuple[npt.NDArray[Any], Mapping[str, Any]]]
-) -> Coordinate | None:
-    """The times that a column of texts along a dimension gives, None without such a column.
-
-    columns: texts (n,) and attributes of each.
-    """
-    for texts, attributes in columns:
-        calendar = str(attributes.get("calendar") or "proleptic_gregorian").strip().lower()
-        if calendar in CALENDARS:
-            known = CALENDARS[calendar]
-            found = of_texts([text_of(each) for each in texts.reshape(-1).tolist()], known)
+        calendar = str(array.attributes.get("calendar") or "proleptic_gregorian").strip().lower()
+        if (array.is_letters or texts) and fits and calendar in CALENDARS:
+            words = [text_of(each) for each in array.texts().reshape(-1).tolist()]
+            found = of_texts(words, CALENDARS[calendar])
             if found is not None:
                 values = np.array(found[0], np.float64)
                 named = {"standard_name": "time", **found[1]}
-                return Coordinate(name=dimension, values=values, attributes=named)
+                return Coordinate(
+                    name=dimension or AXIS_NAMES["t"], values=values, attributes=named
+                )
     return None
 
 
@@ -552,18 +457,29 @@ def _is_replaced(variable: SourceVariable | None) -> bool:
 
 
 def counted_times(source: str, parts: Parts) -> list[npt.NDArray[np.float64]]:
-    """The times of each file, counted as in the first.
+    """The times of each file, counted as in the first, each rounded once.
 
     Files may count since different dates and in different units, in one calendar. Raises InputError
     for times that cannot be compared.
     """
     first_path, first = parts[0]
-    return [
-        time.values
-        if _units(time) == _units(first)
-        else _converted(source, path, time, first_path, first)
-        for path, time in parts
-    ]
+    common, counted = clock(first.attributes), []
+    for path, time in parts:
+        if _units(time) == _units(first):
+            counted.append(time.values)
+            continue
+        own = clock(time.attributes)
+        if own is None or common is None or own.calendar != common.calendar:
+            here, there = (" ".join(_units(each)).strip() or "none" for each in (time, first))
+            raise InputError(
+                f"{source}: the time in {path} has not the units of the time in {first_path}:"
+                f" {here} and {there}"
+            )
+        if not np.isfinite(time.values).all():
+            raise InputError(f"{source}: the times in {path} are not all finite")
+        values = [common.value(own.instant(float(value))) for value in time.values]
+        counted.append(np.array(values))
+    return counted
 
 
 def join_times(source: str, parts: Parts) -> Coordinate:
@@ -609,22 +525,6 @@ def _check_exact(source: str, parts: Parts, joined: npt.NDArray[np.float64]) -> 
             )
 
 
-def _converted(
-    source: str, path: Path, time: Coordinate, first_path: Path, first: Coordinate
-) -> npt.NDArray[np.float64]:
-    """Times of a file in the units of the first, each rounded once."""
-    own, common = clock(time.attributes), clock(first.attributes)
-    if own is None or common is None or own.calendar != common.calendar:
-        here, there = (" ".join(_units(each)).strip() or "none" for each in (time, first))
-        raise InputError(
-            f"{source}: the time in {path} has not the units of the time in {first_path}:"
-            f" {here} and {there}"
-        )
-    if not np.isfinite(time.values).all():
-        raise InputError(f"{source}: the times in {path} are not all finite")
-    return np.array([common.value(own.instant(float(value))) for value in time.values])
-
-
 def _units(time: Coordinate) -> tuple[str, str]:
     """Units and calendar of a time; a calendar has a meaning beside a date only."""
     units = str(time.attributes.get("units", "")).strip()
@@ -632,31 +532,9 @@ def _units(time: Coordinate) -> tuple[str, str]:
     return units, CALENDARS.get(calendar, calendar) if SINCE.fullmatch(units) else ""
 
 
-TIME_UNITS = {
-    "D": "days",
-    "h": "hours",
-    "m": "minutes",
-    "s": "seconds",
-    "ms": "milliseconds",
-    "us": "microseconds",
-    "ns": "nanoseconds",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Column:
-    """A stored 1-D array (or scalar, length 1) that may be a coordinate.
-
-    `read` gives its values, `along` is the name of its dimension. A column that is not `numeric`
-    holds labels, such as the names of members.
-    """
-
-    name: str
-    length: int
-    along: str | None = None
-    read: Callable[[], npt.NDArray[Any]]
-    attributes: Mapping[str, Any]
-    numeric: bool = True
+UNIT_NAMES = "D=days h=hours m=minutes s=seconds ms=milliseconds us=microseconds ns=nanoseconds"
+TIME_UNITS = dict(each.split("=") for each in UNIT_NAMES.split())
+"""Units of time by numpy's code."""
 
 
 def coordinate(
@@ -677,12 +555,9 @@ def coordinate(
                 f"{source}: coordinate {name} holds dates that cannot be counted ({stored.dtype},"
                 " or one is missing)"
             )
-        # since the first date, and not since 1970: nanoseconds since then exceed what float64 can
-        # hold
-        extra = {
-            "units": f"{TIME_UNITS[unit]} since {stored[0]}",
-            "calendar": "proleptic_gregorian",
-        }
+        # since the first date, and not since 1970: float64 cannot hold nanoseconds since then
+        units = f"{TIME_UNITS[unit]} since {stored[0]}"
+        extra = {"units": units, "calendar": "proleptic_gregorian"}
         stored = (stored - stored[0]).astype(np.int64)
     numbers = stored.astype(np.float64)
     if stored.dtype.kind in "iu" and np.unique(numbers).size != np.unique(stored).size:
@@ -730,15 +605,10 @@ def beside(
             assert column is not None
             coords[axis] = coordinate(source, column.name, column.read(), column.attributes)
         elif columns and not certain and columns[0].length in shape and columns[0].length > 1:
-            column = columns[0]
-            assumed = (
-                f"axis {axis} of length {lengths[axis]}" if axis in lengths else f"no axis {axis}"
-            )
-            wrong = (
-                f"{column.name} has {column.length} values, but read as ({','.join(axes)})"
-                f" the array {tuple(shape)} has {assumed}"
-            )
+            length = f" of length {lengths[axis]}" if axis in lengths else ""
             raise InputError(
-                f"{source}: {wrong}; say what its dimensions are with --axes, such as t,z,y,x"
+                f"{source}: {columns[0].name} has {columns[0].length} values, but read as"
+                f" ({','.join(axes)}) the array {tuple(shape)} has {'' if length else 'no '}axis"
+                f" {axis}{length}; say what its dimensions are with --axes, such as t,z,y,x"
             )
     return coords

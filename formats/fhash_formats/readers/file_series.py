@@ -34,11 +34,10 @@ HEAD_BYTES = 4096
 """Bytes of a file by which its format is known; HDF5 may begin at byte 2048."""
 
 DTYPES = {
-    f"{kind}{8 * size}": f"{letter}{size}"
-    for kind, letter in (("uint", "u"), ("int", "i"))
-    for size in (1, 2, 4, 8)
+    f"{kind}{8 * size}": f"{kind[0]}{size}"
+    for kind, sizes in (("uint", (1, 2, 4, 8)), ("int", (1, 2, 4, 8)), ("float", (2, 4, 8)))
+    for size in sizes
 }
-DTYPES |= {f"float{8 * size}": f"f{size}" for size in (2, 4, 8)}
 """Number types of raw files by long name; the short names are the values."""
 
 ENDIANS: dict[str, Literal["<", ">"]] = {"little": "<", "big": ">"}
@@ -65,19 +64,13 @@ def parse_shape(text: str) -> dict[str, int]:
     """
     shape: dict[str, int] = {}
     for part in text.split(","):
-        axis, equals, length = (word.strip() for word in part.partition("="))
-        if (
-            axis not in AXES
-            or not equals
-            or not length.isascii()
-            or not length.isdigit()
-            or axis in shape
-        ):
+        match = re.fullmatch(r"\s*([tzyx])\s*=\s*([0-9]+)\s*", part)
+        if match is None or match[1] in shape:
             raise InputError(
                 f"shape '{text}': cannot use '{part.strip()}'; write each axis once, such as"
                 " x=64,y=64,z=32,t=10"
             )
-        shape[axis] = int(length)
+        shape[match[1]] = int(match[2])
     return shape
 
 
@@ -186,10 +179,8 @@ class Request:
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was named for a format that has none."""
         if self.var is not None:
-            raise InputError(
-                f"{source}: --var {self.var} cannot be used, this format holds one array without a"
-                " name"
-            )
+            told = f"--var {self.var} cannot be used, this format holds one array without a name"
+            raise InputError(f"{source}: {told}")
 
 
 LONGEST_MESSAGE = 240
@@ -247,84 +238,68 @@ def naming(source: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Stamp:
-    """Size, time of change and identity of a file when it was opened.
+    """State of a file when it was opened: size, time of change, identity.
 
     Readers check it around every frame.
     """
 
     path: Path
     size: int
-    changed: int
-    identity: int
+    state: object
+    files: int = 0
 
     @classmethod
-    def of(cls, path: Path) -> Stamp:
-        """The stamp of a file as it is now; raises InputError if it is gone."""
+    def of(cls, path: Path) -> Self:
+        """The stamp of what is at the path now; raises InputError if it is gone."""
         with refusing(f"{path} cannot be read"):
-            found = os.stat(path)
-        return cls(path, found.st_size, found.st_mtime_ns, found.st_ino)
+            return cls(path, *cls._look(path))
+
+    @staticmethod
+    def _look(path: Path) -> tuple[int, object, int]:
+        found = os.stat(path)
+        return found.st_size, (found.st_mtime_ns, found.st_ino), 0
 
     def check(self) -> None:
-        """Raise InputError if the file has changed, so that frames of two states never mix."""
-        now = Stamp.of(self.path)
-        if now != self:
-            grown = (
-                f"{self.size} bytes before, {now.size} now"
-                if now.size != self.size
-                else "same size, written again"
+        """Raise InputError if anything has changed, so that frames of two states never mix."""
+        now = self.of(self.path)
+        if now == self:
+            return
+        told = "same size, written again"
+        if now.files != self.files:
+            told = (
+                f"{self.files} files and {self.size} bytes before, {now.files} and {now.size} now"
             )
-            raise InputError(
-                f"{self.path} changed while it was being read ({grown}); wait until it is complete"
-                " and start again"
-            )
+        elif now.size != self.size:
+            told = f"{self.size} bytes before, {now.size} now"
+        raise InputError(
+            f"{self.path} changed while it was being read ({told}); wait until it is complete and"
+            " start again"
+        )
 
 
-@dataclass(frozen=True)
-class FolderStamp:
-    """Content of a folder: number of files, their bytes, and a digest of names, sizes and times.
+class FolderStamp(Stamp):
+    """State of a folder: number of files, their bytes, and a digest of names, sizes and times.
 
     It looks at every file, which is too slow around every frame: `Series.check` uses it.
     """
 
-    path: Path
-    files: int
-    size: int
-    digest: bytes
-
-    @classmethod
-    def of(cls, path: Path) -> FolderStamp:
-        """The stamp of a folder as it is now; raises InputError if it is gone."""
+    @staticmethod
+    def _look(path: Path) -> tuple[int, object, int]:
         files, size, digest = 0, 0, hashlib.sha256()
-        with refusing(f"{path} cannot be read"):
-            folders = [os.fspath(path)]
-            while folders:
-                folder = folders.pop()
-                with os.scandir(folder) as found:
-                    entries = sorted(found, key=lambda entry: entry.name)
-                for entry in entries:
-                    if entry.is_dir():
-                        folders.append(entry.path)
-                        continue
-                    state = os.stat(entry.path)
-                    files, size = files + 1, size + state.st_size
-                    figures = f"{state.st_size} {state.st_mtime_ns} {state.st_ino}"
-                    digest.update(f"{entry.path}\0{figures}\0".encode(errors="surrogateescape"))
-        return cls(path, files, size, digest.digest())
-
-    def check(self) -> None:
-        """Raise InputError if anything in the folder has changed since it was opened."""
-        now = FolderStamp.of(self.path)
-        if now != self:
-            what = "something in it was written again"
-            if (now.files, now.size) != (self.files, self.size):
-                what = (
-                    f"{self.files} files and {self.size} bytes before,"
-                    f" {now.files} and {now.size} now"
-                )
-            raise InputError(
-                f"{self.path} changed while it was being read ({what}); wait until it is complete"
-                " and start again"
-            )
+        folders = [os.fspath(path)]
+        while folders:
+            folder = folders.pop()
+            with os.scandir(folder) as found:
+                entries = sorted(found, key=lambda entry: entry.name)
+            for entry in entries:
+                if entry.is_dir():
+                    folders.append(entry.path)
+                    continue
+                state = os.stat(entry.path)
+                files, size = files + 1, size + state.st_size
+                figures = f"{state.st_size} {state.st_mtime_ns} {state.st_ino}"
+                digest.update(f"{entry.path}\0{figures}\0".encode(errors="surrogateescape"))
+        return size, digest.digest(), files
 
 
 SLAB_BYTES = 64 * 2**20
@@ -344,8 +319,8 @@ def native(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredFiles:
-    """The files of a series.
+class Stored:
+    """The values of a series as they lie in its files.
 
     Attributes:
         source: name for messages, that of the first file.
@@ -353,20 +328,6 @@ class StoredFiles:
         beside: further files that hold values, checked likewise.
         folder: stamp of all files, which `FileSeries.check` alone looks at.
         close: lets go of all that is open.
-    """
-
-    source: str
-    stamp: Stamp | None = None
-    beside: Sequence[Path] = ()
-    folder: FolderStamp | None = None
-    close: Callable[[], None] = lambda: None
-
-
-@dataclass(frozen=True, kw_only=True)
-class StoredValues:
-    """The values of a series as they lie in its files.
-
-    Attributes:
         shape, axes: lengths and axes of the dimensions, in the file's order.
         dtype: type of the physical values, in any byte order.
         fetch: `fetch(slices)` returns a fresh array of the file's dimensions.
@@ -379,19 +340,23 @@ class StoredValues:
             `Series.defaults`.
     """
 
+    source: str
+    stamp: Stamp | None
+    beside: Sequence[Path]
+    folder: FolderStamp | None
+    close: Callable[[], None]
     shape: Sequence[int]
     axes: Sequence[str]
     dtype: np.dtype[Any]
     fetch: Fetch
-    chunks: Sequence[int | Sequence[int]] | None = None
-    packing: Packing | None = None
-    not_stored: NotStored | None = None
-    default_fill: float | None = None
+    chunks: Sequence[int | Sequence[int]] | None
+    packing: Packing | None
+    not_stored: NotStored | None
+    default_fill: float | None
 
 
 class FileSeries(Series):
-    """A series whose frames are fetched from a file as slices in the file's own order of
-    dimensions.
+    """A series whose frames are fetched from a file, as slices in the file's order of dimensions.
 
     Raises InputError for a shape or type that cannot be a series.
 
@@ -402,47 +367,41 @@ class FileSeries(Series):
 
     def __init__(
         self,
-        *,
-        files: StoredFiles,
         name: str,
-        values: StoredValues,
-        coords: Mapping[str, Coordinate] | None = None,
-        attributes: Mapping[str, Any] | None = None,
+        stored: Stored,
+        coords: Mapping[str, Coordinate],
+        attributes: Mapping[str, Any],
     ) -> None:
-        lengths = dict(zip(values.axes, values.shape, strict=True))
-        self.source, self.name, self.dtype = files.source, plain_text(name), native(values.dtype)
-        self.files = () if files.stamp is None else (Path(files.source), *files.beside)
+        lengths = dict(zip(stored.axes, stored.shape, strict=True))
+        self.source, self.name, self.dtype = stored.source, plain_text(name), native(stored.dtype)
+        self.files = () if stored.stamp is None else (Path(stored.source), *stored.beside)
         self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
-        self.attributes = dict(attributes or {})
+        self.attributes = dict(attributes)
         self.units = str(self.attributes.get("units", ""))
-        coords = dict(coords or {})
         if "t" in coords:
-            coords["t"], self.remark = settled(coords["t"])
+            time, self.remark = settled(coords["t"])
+            coords = {**coords, "t": time}
         self.given = frozenset(coords)
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
         } | {axis: replace(each, name=plain_form(each.name)) for axis, each in coords.items()}
-        self._axes, self._fetch, self._close = tuple(values.axes), values.fetch, files.close
-        opened = () if files.stamp is None else (files.stamp,)
-        self._quick = (*opened, *map(Stamp.of, files.beside))
-        self.stamps: tuple[Stamp | FolderStamp, ...] = (
-            self._quick if files.folder is None else (*self._quick, files.folder)
-        )
-        frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
-        most = max(1, SLAB_BYTES // frame_bytes)
-        self._starts = _slabs(_steps_of_chunks(self._axes, values.shape, values.chunks), most)
+        self._axes, self._fetch, self._close = tuple(stored.axes), stored.fetch, stored.close
+        opened = () if stored.stamp is None else (stored.stamp,)
+        self._quick = (*opened, *map(Stamp.of, stored.beside))
+        self.stamps = self._quick if stored.folder is None else (*self._quick, stored.folder)
+        most = max(1, SLAB_BYTES // (self.dtype.itemsize * prod(self.shape[1:])))
+        self._starts = _slabs(_steps_of_chunks(self._axes, stored.shape, stored.chunks), most)
         self._held_slab: tuple[int, npt.NDArray[Any]] | None = None
         self._missing: Packing | None = None
         self._sought: dict[float, Any] = {}
-        self._met: set[float] = set()
-        self.occurring = self._met
-        self.not_stored = values.not_stored
-        self._default, self._defaults = values.default_fill, set[float]()
-        self.defaults = self._defaults
-        if values.packing is not None:
-            note_packing(self, values.packing)
-        self._unpack_fill(values.packing)
+        self.occurring = self._met = set[float]()
+        self.not_stored = stored.not_stored
+        self._default = stored.default_fill
+        self.defaults = self._defaults = set[float]()
+        if stored.packing is not None:
+            note_packing(self, stored.packing)
+        self._unpack_fill(stored.packing)
 
     def hide(self, missing: Sequence[float]) -> None:
         """Make some values missing: they become NaN, and integers become floats.
@@ -528,14 +487,13 @@ class FileSeries(Series):
     def _block(self, start: int, stop: int) -> npt.NDArray[Any]:
         """Steps start to stop as (t, z, y, x)."""
         steps = f"step {start}" if stop == start + 1 else f"steps {start} to {stop - 1}"
+        expected = dict(zip(AXES, (stop - start, *self.shape[1:]), strict=True))
+        ranges = {axis: slice(0, length) for axis, length in expected.items()}
+        ranges["t"] = slice(start, stop)
         self._check_files()
         with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
-            ranges = {
-                axis: slice(0, length) for axis, length in zip(AXES, self.shape, strict=True)
-            } | {"t": slice(start, stop)}
             values = self._fetch(tuple(ranges[axis] for axis in self._axes))
         self._check_files()
-        expected = {**dict(zip(AXES, self.shape, strict=True)), "t": stop - start}
         if values.shape != tuple(expected[axis] for axis in self._axes):
             raise InputError(
                 f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed"
@@ -552,11 +510,8 @@ class FileSeries(Series):
                 if value not in self._met and (values == fill).any()
             )
             values = self._missing.unpack(values.astype(self._missing.stored, copy=False))
-        present = [axis for axis in AXES if axis in self._axes]
-        ordered = values.transpose([self._axes.index(axis) for axis in present])
-        return np.expand_dims(
-            ordered, tuple(place for place, axis in enumerate(AXES) if axis not in present)
-        )
+        ordered = values.transpose([self._axes.index(each) for each in AXES if each in self._axes])
+        return ordered.reshape([*expected.values()])
 
 
 def _steps_of_chunks(

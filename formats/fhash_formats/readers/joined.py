@@ -8,9 +8,9 @@ import os
 import re
 import warnings
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
+from itertools import accumulate, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.cf import counted_times, is_numbered, join_times
+from fhash_formats.readers.cf import NUMBERED, counted_times, join_times
 from fhash_formats.readers.file_series import FileSeries, FolderStamp, Stamp
 from fhash_formats.readers.surroundings import warn_left_out
 from fhash_formats.series import (
@@ -36,70 +36,42 @@ from fhash_formats.support.values import PACKING, typed_attribute
 DIFFERS = "differs between the files"
 
 
-def joined_metadata(
-    source: str, parts: Iterable[SourceMetadata | None], time: Coordinate
-) -> SourceMetadata | None:
-    """The metadata of files one after the other; None where some file says nothing.
-
-    source: the pattern of the files. time: of all steps. Warns (FhashWarning) of what is left out.
-    """
-    collected: _Joined | None = None
-    for part in parts:
-        if part is None:
-            return None
-        if collected is None:
-            collected = _Joined(part, time)
-        else:
-            collected.add(part)
-    if collected is None:
-        return None
-    metadata = collected.result(Path(source).name)
-    warn_left_out(f"{source}: not everything beside the values is kept", collected.left_out)
-    return metadata
-
-
 class _Joined:
     """The metadata of some files, as far as they were added."""
 
     def __init__(self, first: SourceMetadata, time: Coordinate) -> None:
+        """Begin with those of the first file. time: of all steps."""
         self.left_out: dict[str, str] = {}
-        self._first, self._time = first, time
-        self._along = first.along("t")
-        self._attributes = dict(first.attributes)
-        self._own, self._stored = dict(first.variable_attributes), first.stored
+        self._first, self._time, self._along = first, time, first.along("t")
+        self._attributes, self._own = dict(first.attributes), dict(first.variable_attributes)
+        self._stored = first.stored
         self._pieces = {each.name: [each] for each in first.variables}
 
     def add(self, part: SourceMetadata) -> None:
         """Add the next file."""
         if part.dimensions != self._first.dimensions:
             self.left_out["dimensions"] = DIFFERS
-        for name, value in list(self._attributes.items()):
-            if name != "history" and not _same_attribute(value, part.attributes.get(name)):
+        for name in _differing(self._attributes, part.attributes):
+            if name in self._attributes and name != "history":
                 del self._attributes[name]
                 self.left_out[f":{name}"] = DIFFERS
-        self._add_own(part)
+        for name in _differing(self._own, part.variable_attributes):
+            if name in self._own or name in PACKING:
+                self._own.pop(name, None)
+                self.left_out[name] = DIFFERS
+        unpacked = PACKING & self.left_out.keys()
+        for name in sorted(PACKING & self._own.keys()) if unpacked else ():
+            del self._own[name]
+            self.left_out[name] = f"of a packing that {DIFFERS}"
+        if unpacked or part.stored != self._stored:
+            self._stored = None
         for name, pieces in list(self._pieces.items()):
             other = part.named(name)
             if other is None or not self._fits(pieces[0], other):
                 del self._pieces[name]
                 self.left_out[name] = DIFFERS
-            elif self._has_time(other):
+            elif self._along in other.dimensions:
                 pieces.append(other)
-
-    def _add_own(self, part: SourceMetadata) -> None:
-        """Keep the attributes of the variable that the next file has, too; a packing as a whole."""
-        there = part.variable_attributes
-        for name in [*self._own, *sorted(PACKING & (there.keys() - self._own.keys()))]:
-            if not _same_attribute(self._own.get(name), there.get(name)):
-                self._own.pop(name, None)
-                self.left_out[name] = DIFFERS
-        if PACKING & self.left_out.keys():
-            for name in sorted(PACKING & self._own.keys()):
-                del self._own[name]
-                self.left_out[name] = f"of a packing that {DIFFERS}"
-            self._stored = None
-        elif part.stored != self._stored:
-            self._stored = None
 
     def result(self, file: str) -> SourceMetadata:
         """The metadata of all files."""
@@ -109,16 +81,22 @@ class _Joined:
             if name in dimensions or not is_plain_name(name):
                 name = "time_of_file"
             dimensions = {name: "t", **dimensions}
-        stamped = self._time_variable(name)
-        # bounds of times that each file counts in its own way mean nothing together
-        lost = {str(each) for each in self._lost_with(stamped)}
-        variables = [stamped]
-        for each, pieces in self._pieces.items():
-            if each != stamped.name and each not in lost:
-                variables.append(_concatenated(pieces, self._along))
+        time = self._time_variable(name)
+        lost = set()
+        if self._along is None or time.name not in self._pieces:
+            # bounds of times that each file counts in its own way mean nothing together
+            keys = {"bounds", "climatology"} & time.attributes.keys()
+            lost = {str(time.attributes[key]) for key in keys}
+        variables = [time]
+        for each, (first, *others) in self._pieces.items():
+            if others:
+                values = [first.values, *(other.values for other in others)]
+                axis = first.dimensions.index(name)
+                first = replace(first, values=np.concatenate(values, axis=axis))
+            if each not in (time.name, *lost):
+                variables.append(first)
         self.left_out |= dict.fromkeys(lost & self._pieces.keys(), DIFFERS)
-        kept = {each.name for each in variables}
-        gone = {each.name for each in self._first.variables} - kept
+        gone = {each.name for each in self._first.variables} - {each.name for each in variables}
         return replace(
             self._first,
             dimensions=dimensions,
@@ -150,56 +128,28 @@ class _Joined:
             values = narrow if np.array_equal(narrow.astype(np.float64), values) else values
         return replace(first, dimensions=(dimension,), values=values)
 
-    def _lost_with(self, time: SourceVariable) -> list[Any]:
-        """Names of the bounds of the times, unless all files count these in the same way."""
-        pieces = self._pieces.get(time.name)
-        if pieces is not None and self._along is not None:
-            return []
-        return [time.attributes[key] for key in ("bounds", "climatology") if key in time.attributes]
-
-    def _has_time(self, variable: SourceVariable) -> bool:
-        return self._along is not None and self._along in variable.dimensions
-
     def _fits(self, one: SourceVariable, other: SourceVariable) -> bool:
         """Whether two files have the same array, or two pieces of one along time."""
-        if one.dimensions != other.dimensions or one.values.dtype != other.values.dtype:
+        a, b = one.values, other.values
+        if one.dimensions != other.dimensions or a.dtype != b.dtype or a.ndim != b.ndim:
             return False
-        if not _same_attributes(one.attributes, other.attributes):
+        if _differing(one.attributes, other.attributes):
             return False
-        if not self._has_time(one):
-            return one.values.shape == other.values.shape and (
-                one.values.tolist() == other.values.tolist()
-                if one.values.dtype == object
-                else one.values.tobytes() == other.values.tobytes()
-            )
-        shapes = [
-            [
-                n
-                for name, n in zip(each.dimensions, each.values.shape, strict=True)
-                if name != self._along
-            ]
-            for each in (one, other)
-        ]
-        return shapes[0] == shapes[1]
+        if self._along in one.dimensions:
+            axis = one.dimensions.index(self._along)
+            return np.array_equal(np.delete(a.shape, axis), np.delete(b.shape, axis))
+        same = a.tolist() == b.tolist() if a.dtype == object else a.tobytes() == b.tobytes()
+        return a.shape == b.shape and same
 
 
-def _concatenated(pieces: list[SourceVariable], along: str | None) -> SourceVariable:
-    """An array of all files."""
-    first = pieces[0]
-    if len(pieces) == 1 or along is None:
-        return first
-    axis = first.dimensions.index(along)
-    return replace(first, values=np.concatenate([each.values for each in pieces], axis=axis))
-
-
-def _same_attributes(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    return one.keys() == other.keys() and all(
-        _same_attribute(value, other[name]) for name, value in one.items()
-    )
-
-
-def _same_attribute(one: Any, other: Any) -> bool:
-    return json.dumps(typed_attribute(one)) == json.dumps(typed_attribute(other))
+def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Names of the attributes that not both have, or that differ."""
+    return [
+        name
+        for name in dict.fromkeys((*one, *other))
+        if json.dumps(typed_attribute(one.get(name)))
+        != json.dumps(typed_attribute(other.get(name)))
+    ]
 
 
 def is_pattern(text: str) -> bool:
@@ -234,10 +184,10 @@ def warn_of_gaps(pattern: str, paths: Sequence[Path]) -> None:
     words = [re.split(r"([0-9]+)", str(path)) for path in paths]
     if len({len(each) for each in words}) > 1:
         return
-    places = [n for n in range(len(words[0])) if len({each[n] for each in words}) > 1]
-    if len(places) != 1 or re.match(r"(19|20)[0-9]{4}", words[0][places[0]]):
+    columns = [texts for texts in zip(*words, strict=True) if len(set(texts)) > 1]
+    if len(columns) != 1 or re.match(r"(19|20)[0-9]{4}", columns[0][0]):
         return
-    texts = [each[places[0]] for each in words]
+    texts = columns[0]
     if not all(text.isdecimal() and len(text) < 18 for text in texts):
         return
     gaps = np.diff(np.array(texts, dtype=np.int64))
@@ -309,12 +259,12 @@ class JoinedSeries(Series):
                 self._parts.append(
                     _Part(path=path, stamps=part.stamps, steps=range(part.shape[0]), time=time)
                 )
-                never = never or part.not_stored
                 told = part.not_stored
+                never = never or told
                 shares[path] = np.zeros(part.shape[0]) if told is None else told.shares
                 names.append(part.name)
                 self.remark = self.remark or part.remark
-                counted = counted and not is_numbered(part.remark)
+                counted = counted and not part.remark.endswith(NUMBERED)
                 files += part.files
         assert first is not None
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
@@ -327,10 +277,8 @@ class JoinedSeries(Series):
         if never is not None:
             cut = [shares[part.path][list(part.steps)] for part in self._parts]
             self.not_stored = replace(never, shares=np.concatenate(cut))
-        self._met = set(first.occurring)
-        self.occurring = self._met
-        self._defaults = set(first.defaults)
-        self.defaults = self._defaults
+        self.occurring = self._met = set(first.occurring)
+        self.defaults = self._defaults = set(first.defaults)
         self._ends = list(accumulate(len(part.steps) for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times(counted)}
@@ -371,18 +319,28 @@ class JoinedSeries(Series):
         return series
 
     def _joined_metadata(self) -> SourceMetadata | None:
-        """The metadata of all files, which are opened one after the other."""
+        """The metadata of all files, opened one after the other; None where one says nothing.
 
-        def each() -> Iterator[SourceMetadata | None]:
-            for number, part in enumerate(self._parts):
-                with self._reopened(part) as series, warnings.catch_warnings():
-                    if number:
-                        warnings.simplefilter("ignore")  # it was said of the first file
-                    metadata = series.metadata
-                cut = metadata is not None and len(part.steps) < series.shape[0]
-                yield metadata.cut({"t": part.steps}) if metadata and cut else metadata
-
-        return joined_metadata(self.source, each(), self.coords["t"])
+        Warns (FhashWarning) of what is left out.
+        """
+        joined: _Joined | None = None
+        for part in self._parts:
+            with self._reopened(part) as series, warnings.catch_warnings():
+                if joined is not None:
+                    warnings.simplefilter("ignore")  # it was said of the first file
+                found = series.metadata
+            if found is None:
+                return None
+            if len(part.steps) < series.shape[0]:
+                found = found.cut({"t": part.steps})
+            if joined is None:
+                joined = _Joined(found, self.coords["t"])
+            else:
+                joined.add(found)
+        assert joined is not None
+        metadata = joined.result(Path(self.source).name)
+        warn_left_out(f"{self.source}: not everything beside the values is kept", joined.left_out)
+        return metadata
 
     def _times(self, counted: bool) -> Coordinate:
         """The times of all files; the numbers of the steps unless all files count theirs."""
@@ -391,11 +349,9 @@ class JoinedSeries(Series):
             warn_of_gaps(self.source, [part.path for part in self._parts])
         if not times or not counted:
             return index_coordinate("t", self.shape[0])
-        for part in self._parts:
-            if part.time is None:
-                raise InputError(
-                    f"{self.source}: {part.path} has no time, and {times[0][0]} has one"
-                )
+        if len(times) < len(self._parts):
+            path = next(part.path for part in self._parts if part.time is None)
+            raise InputError(f"{self.source}: {path} has no time, and {times[0][0]} has one")
         return join_times(self.source, times)
 
 
@@ -412,37 +368,26 @@ def _without_overlap(source: str, parts: Sequence[_Part], overlap: str) -> list[
     for each, (path, _) in zip(values, timed, strict=True):
         if not (np.isfinite(each).all() and (np.diff(each) > 0).all()):
             raise InputError(f"{source}: times do not increase in {path}")
-    kept: dict[int, range] = {}
-    if overlap == "first":
-        end = -np.inf
-        for number, each in enumerate(values):
-            kept[number] = range(int(np.searchsorted(each, end, "right")), len(each))
-            end = max(end, each[-1])
-    else:
-        begin = np.inf
-        for number, each in reversed(list(enumerate(values))):
-            kept[number] = range(int(np.searchsorted(each, begin, "left")))
-            begin = min(begin, each[0])
+    is_first = overlap == "first"
+    edge = -np.inf if is_first else np.inf
     found = []
-    for number, part in enumerate(parts):
-        steps, (_, time) = kept[number], timed[number]
+    for part, each in list(zip(parts, values, strict=True))[:: 1 if is_first else -1]:
+        place = int(np.searchsorted(each, edge, "right" if is_first else "left"))
+        steps = range(place, len(each)) if is_first else range(place)
+        edge = max(edge, each[-1]) if is_first else min(edge, each[0])
         if steps:
-            time = replace(time, values=time.values[steps.start : steps.stop])
+            assert part.time is not None
+            time = replace(part.time, values=part.time.values[steps.start : steps.stop])
             found.append(replace(part, steps=steps, time=time))
-    return found
+    return found[:: 1 if is_first else -1]
 
 
 def _common_name(names: Sequence[str]) -> str:
-    """The name of all, or their common beginning before the numbers: "frame" for frame_01 and
-    frame_02."""
+    """The name of all, or what all begin with: "frame" for frame_01 and frame_02."""
     low, high = min(names), max(names)
-    if low == high:
-        return low
-    same = next(
-        (place for place, (one, other) in enumerate(zip(low, high, strict=False)) if one != other),
-        len(low),
-    )
-    return low[:same].rstrip("0123456789_-. ") or names[0]
+    pairs = takewhile(lambda pair: pair[0] == pair[1], zip(low, high, strict=False))
+    common = "".join(letter for letter, _ in pairs).rstrip("0123456789_-. ")
+    return low if low == high else common or names[0]
 
 
 def _check_alike(part: Series, path: Path, first: Series, first_path: Path) -> None:

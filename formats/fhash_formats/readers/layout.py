@@ -7,7 +7,6 @@ user by `--axes`; where two readings are likely, the user is asked.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,19 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.cf import Column, assign_axes, coordinate
+from fhash_formats.readers.cf import Column, coordinate
 from fhash_formats.readers.file_series import Request
 from fhash_formats.series import AXES, Coordinate
-from fhash_formats.support.values import text_of
+from fhash_formats.support.values import is_number, text_of
 
 Read = Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
 """Values at a slice or an index along each dimension."""
-
-FEWEST_COMPONENTS = 2
-"""Length of a last dimension from which on it may hold the components of a vector."""
-
-MOST_COMPONENTS = 9
-"""Length of a last dimension up to which it may hold components; a tensor in 3-D has 9."""
 
 FURTHER_NAMES = """member members ensemble ensemble_member ens realization realisation number model
 component components comp vector vec direction channel channels band bands species spec tracer
@@ -70,15 +63,13 @@ def shared_roles(arrays: Iterable[Sequence[Dimension]]) -> dict[str, str]:
     for each in arrays:
         dimensions = with_roles(each, found)
         picked = single(dimensions, {})
-        kept = [one for place, one in enumerate(dimensions) if place not in picked]
+        kept = left(dimensions, picked)
         if len(kept) != len(AXES) or any(one.further for one in kept):
             continue
         if all(one.role for one in kept) or is_asked(dimensions, picked, selected=False):
             continue
         try:
-            axes = assign_axes(
-                "", [n.length for n in kept], [n.role for n in kept], [n.name for n in kept], None
-            )
+            axes = assign_axes("", kept, None)
         except InputError:  # of this array; it is said where the array is wanted
             continue
         for one, axis in zip(kept, axes, strict=True):
@@ -89,12 +80,7 @@ def shared_roles(arrays: Iterable[Sequence[Dimension]]) -> dict[str, str]:
 
 def with_roles(dimensions: Sequence[Dimension], roles: Mapping[str, str]) -> list[Dimension]:
     """The dimensions, each without a role with that of its name. roles: see `shared_roles`."""
-    return [
-        replace(one, role=roles[one.name])
-        if one.role is None and one.name is not None and one.name in roles
-        else one
-        for one in dimensions
-    ]
+    return [replace(one, role=one.role or roles.get(one.name or "")) for one in dimensions]
 
 
 def label(place: int, dimension: Dimension) -> str:
@@ -104,10 +90,12 @@ def label(place: int, dimension: Dimension) -> str:
 
 def shown(dimensions: Sequence[Dimension]) -> str:
     """The dimensions for a message: "member=5, lat=64"."""
-    return ", ".join(
-        f"{label(place, dimension)}={dimension.length}"
-        for place, dimension in enumerate(dimensions)
-    )
+    return ", ".join(f"{label(place, each)}={each.length}" for place, each in enumerate(dimensions))
+
+
+def left(dimensions: Sequence[Dimension], picked: Mapping[int, int]) -> list[Dimension]:
+    """The dimensions along which nothing is selected."""
+    return [dimension for place, dimension in enumerate(dimensions) if place not in picked]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,11 +113,9 @@ class Layout:
     axes: tuple[str, ...]
 
     @property
-    def kept(self) -> tuple[Dimension, ...]:
+    def kept(self) -> list[Dimension]:
         """Dimensions that are axes."""
-        return tuple(
-            dimension for place, dimension in enumerate(self.dimensions) if place not in self.picked
-        )
+        return left(self.dimensions, self.picked)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -151,17 +137,10 @@ class Layout:
 
         def fetched(ranges: tuple[slice | int, ...]) -> npt.NDArray[Any]:
             axes = iter(ranges)
-            values = read(
-                tuple(
-                    slice(self.picked[place], self.picked[place] + 1)
-                    if place in self.picked
-                    else next(axes)
-                    for place in range(len(self.dimensions))
-                )
-            )
-            return values.reshape(
-                [n for place, n in enumerate(values.shape) if place not in self.picked]
-            )
+            one = {place: slice(index, index + 1) for place, index in self.picked.items()}
+            places = range(len(self.dimensions))
+            values = read(tuple(one[n] if n in one else next(axes) for n in places))
+            return values.reshape([values.shape[place] for place in places if place not in one])
 
         return fetched
 
@@ -180,12 +159,8 @@ class Layout:
             if column is None or role is None or role in coords or role in self.axes:
                 continue
             if column.numeric and column.length == dimension.length:
-                positions = coordinate(source, column.name, column.read(), column.attributes)
-                coords[role] = Coordinate(
-                    name=positions.name,
-                    values=positions.values[index : index + 1],
-                    attributes=positions.attributes,
-                )
+                found = coordinate(source, column.name, column.read(), column.attributes)
+                coords[role] = replace(found, values=found.values[index : index + 1])
         return coords
 
     def attributes(self) -> dict[str, str]:
@@ -204,30 +179,73 @@ def arrange(source: str, name: str, dimensions: Sequence[Dimension], request: Re
     Raises InputError where a selection does not fit, where something must be selected, and where
     two readings are likely.
     """
+    what = f"{source}: {name} has {len(dimensions)} dimensions ({shown(dimensions)})"
     picked = picks(source, name, dimensions, request.select)
     if request.axes is None:
         picked |= single(dimensions, picked)
-        open_places = must_select(dimensions, picked)
+        open_places = [(label(n, dimensions[n]), n) for n in must_select(dimensions, picked)]
         if open_places:
-            raise InputError(_unselected(source, name, dimensions, picked, open_places))
-    kept = [dimension for place, dimension in enumerate(dimensions) if place not in picked]
+            options = " ".join(f"--select {each}=0" for each, _ in open_places)
+            told = " and ".join(f"{each} has {dimensions[n].length}" for each, n in open_places)
+            raise InputError(
+                f"{what}, and a series only t, z, y and x; select one index of the others, such as"
+                f" {options} ({told})"
+            )
+    kept = left(dimensions, picked)
     asking = request.asked and request.axes is None
     if asking and is_asked(dimensions, picked, selected=bool(request.select)):
-        raise InputError(_question(source, name, dimensions, kept))
-    if len(kept) < 2:
+        as_axes, as_components = readings(dimensions, kept)
+        *lengths, last = [str(dimension.length) for dimension in kept]
+        form = "x".join([*lengths, last])
+        if len(kept) == len(AXES) and as_axes.endswith("t,z,y,x"):
+            form = f"{lengths[0]} steps of {'x'.join([*lengths[1:], last])}"
         raise InputError(
-            f"{source}: --select leaves {len(kept)} of the dimensions ({shown(dimensions)}) of"
-            f" {name}; at least 2 are needed"
+            f"{source}: {name} is {form} vertices ({as_axes}), or a {'x'.join(lengths)} field of"
+            f" {last} components ({as_components}); say which, 'fhash info {source}' prints both"
+            " commands"
         )
-    shape = [dimension.length for dimension in kept]
-    axes = assign_axes(
-        source,
-        shape,
-        [dimension.role for dimension in kept],
-        [dimension.name for dimension in kept],
-        request.axes,
-    )
+    if len(kept) < 2:
+        raise InputError(f"{what}; --select leaves {len(kept)}, and at least 2 are needed")
+    axes = assign_axes(source, kept, request.axes)
     return Layout(dimensions=tuple(dimensions), picked=picked, axes=axes)
+
+
+def assign_axes(
+    what: str, kept: Sequence[Dimension], axes: tuple[str, ...] | None
+) -> tuple[str, ...]:
+    """The axis of each of 3 or 4 dimensions.
+
+    `axes`, if the user gave it, decides. Otherwise the roles do. Dimensions without a role take the
+    axes that are left in the order (t, z, y, x). 3 dimensions are (z, y, x) unless a role says
+    time; then they are (t, y, x) first of all.
+
+    Raises InputError where that is ambiguous: two dimensions with one meaning, or an order that
+    cannot be completed with certainty.
+    """
+    roles = [each.role for each in kept]
+    if axes is not None:
+        if len(axes) != len(kept):
+            raise InputError(
+                f"{what}: --axes {','.join(axes)} names {len(axes)} axes, the array has {len(kept)}"
+                f" dimensions {tuple(each.length for each in kept)}"
+            )
+        return axes
+    said = [role for role in roles if role is not None]
+    told = ", ".join(f"{each.name or '?'}={each.length}" for each in kept)
+    if len(set(said)) != len(said):
+        raise InputError(
+            f"{what}: two dimensions of ({told}) mean the same axis; say what they are with --axes,"
+            " such as t,z,y,x"
+        )
+    open_places = len(kept) - len(said)
+    if open_places > 1 and said != sorted(said, key=AXES.index):
+        raise InputError(
+            f"{what}: the order of the dimensions ({told}) is not clear; say what they are with"
+            " --axes, such as x,y,z,t"
+        )
+    free = [axis for axis in (AXES if len(kept) == len(AXES) else AXES[1:]) if axis not in said]
+    fill = iter(free[len(free) - open_places :])
+    return tuple(role if role is not None else next(fill) for role in roles)
 
 
 def single(dimensions: Sequence[Dimension], picked: Mapping[int, int]) -> dict[int, int]:
@@ -237,30 +255,26 @@ def single(dimensions: Sequence[Dimension], picked: Mapping[int, int]) -> dict[i
         excess = len(dimensions) - len(picked) - len(found) - len(AXES)
         if place in picked or dimension.length != 1 or dimension.role is not None:
             continue
-        if dimension.name is None:
-            continue  # the user says which of several it is
-        if dimension.further or excess > 0:
+        # of one without a name, the user says which of several it is
+        if dimension.name is not None and (dimension.further or excess > 0):
             found[place] = 0
     return found
 
 
 def must_select(dimensions: Sequence[Dimension], picked: Mapping[int, int]) -> list[int]:
     """Places of the dimensions along which the user must select an index, likely ones first."""
-    left = [place for place in range(len(dimensions)) if place not in picked]
-    further = [place for place in left if dimensions[place].further]
-    excess = len(left) - len(further) - len(AXES)
+    open_places = [place for place in range(len(dimensions)) if place not in picked]
+    further = [place for place in open_places if dimensions[place].further]
+    others = [place for place in open_places if place not in further]
+    excess = len(others) - len(AXES)
     if excess <= 0:
         return further
-    others = [place for place in left if place not in further]
     roles = [dimensions[place].role for place in others]
     unknown = [
-        place
-        for place in others
-        if dimensions[place].role is None or roles.count(dimensions[place].role) > 1
+        n for n, role in zip(others, roles, strict=True) if not role or roles.count(role) > 1
     ]
-    last = others[-1]
-    if last in unknown and _short([dimensions[place] for place in others]):
-        unknown = [last, *(place for place in unknown if place != last)]
+    if others[-1] in unknown and _short([dimensions[place] for place in others]):
+        unknown = [others[-1], *unknown[:-1]]
     return further + unknown[:excess]
 
 
@@ -270,7 +284,7 @@ def is_asked(dimensions: Sequence[Dimension], picked: Mapping[int, int], *, sele
     It is short, shorter than the two before it, and nothing in the file says what it is. Who has
     selected along it, or has selected until three dimensions were left, has answered.
     """
-    kept = [dimension for place, dimension in enumerate(dimensions) if place not in picked]
+    kept = left(dimensions, picked)
     answered = len(dimensions) - 1 in picked or (selected and len(kept) < len(AXES))
     if answered or len(kept) not in (3, 4):
         return False
@@ -279,11 +293,9 @@ def is_asked(dimensions: Sequence[Dimension], picked: Mapping[int, int], *, sele
 
 
 def _short(kept: Sequence[Dimension]) -> bool:
-    """Whether the last of the dimensions has a length that fits the components of a vector."""
-    last = kept[-1]
-    return FEWEST_COMPONENTS <= last.length <= MOST_COMPONENTS and last.length < min(
-        kept[-2].length, kept[-3].length
-    )
+    """Whether the last of the dimensions may hold components: a vector has 2 or more, tensors 9."""
+    *_, first, second, last = (dimension.length for dimension in kept)
+    return 2 <= last <= 9 and last < min(first, second)
 
 
 def readings(dimensions: Sequence[Dimension], kept: Sequence[Dimension]) -> tuple[str, str]:
@@ -295,38 +307,6 @@ def readings(dimensions: Sequence[Dimension], kept: Sequence[Dimension]) -> tupl
         rest = iter([axis for axis in axes if axis not in (*roles, last)])
         axes = (*(role or next(rest) for role in roles), last)
     return f"--axes {','.join(axes)}", f"--select {label(len(dimensions) - 1, kept[-1])}=0"
-
-
-def _question(
-    source: str, name: str, dimensions: Sequence[Dimension], kept: Sequence[Dimension]
-) -> str:
-    as_axes, as_components = readings(dimensions, kept)
-    *lengths, last = [str(dimension.length) for dimension in kept]
-    form = "x".join([*lengths, last])
-    if len(kept) == len(AXES) and as_axes.endswith("t,z,y,x"):
-        form = f"{lengths[0]} steps of {'x'.join([*lengths[1:], last])}"
-    return (
-        f"{source}: {name} is {form} vertices ({as_axes}), or a {'x'.join(lengths)} field of"
-        f" {last} components ({as_components}); say which, 'fhash info {source}' prints both"
-        " commands"
-    )
-
-
-def _unselected(
-    source: str,
-    name: str,
-    dimensions: Sequence[Dimension],
-    picked: Mapping[int, int],
-    places: Sequence[int],
-) -> str:
-    options = " ".join(f"--select {label(place, dimensions[place])}=0" for place in places)
-    lengths = " and ".join(
-        f"{label(place, dimensions[place])} has {dimensions[place].length}" for place in places
-    )
-    return (
-        f"{source}: {name} has {len(dimensions)} dimensions ({shown(dimensions)}), and a series"
-        f" only t, z, y and x; select one index of the others, such as {options} ({lengths})"
-    )
 
 
 def picks(
@@ -352,9 +332,9 @@ def picks(
 
 def _number_of(dimensions: Sequence[Dimension], key: str) -> int | None:
     """Place of a dimension called by its name, as "dim3" or as "3" or "-1"."""
-    for place, dimension in enumerate(dimensions):
-        if dimension.name == key:
-            return place
+    names = [dimension.name for dimension in dimensions]
+    if key in names:
+        return names.index(key)
     number = key.removeprefix("dim")
     if not number.removeprefix("-").isdecimal() or not number.isascii():
         return None
@@ -370,43 +350,35 @@ def _index(source: str, key: str, text: str, dimension: Dimension) -> int:
     except ValueError:
         return _index_of_label(source, key, text, dimension)
     if not -dimension.length <= index < dimension.length:
+        found = _place_of(index, dimension) is not None
+        advice = f"; {key}={float(index)} is the position of that number" if found else ""
         raise InputError(
             f"{source}: --select {key}={text} is outside the indices 0..{dimension.length - 1}"
-            + _position_of(key, index, dimension)
+            + advice
         )
     return index % dimension.length
 
 
-def _position_of(key: str, number: int, dimension: Dimension) -> str:
-    """Advice on selecting the position that a whole number is, where the coordinate has it."""
+def _place_of(number: float, dimension: Dimension, rtol: float = 0) -> int | None:
+    """Index of a position along a dimension; None where it has no such."""
     column = dimension.column
     if column is None or not column.numeric:
-        return ""
-    found = np.flatnonzero(column.read().reshape(-1) == number)
-    return f"; {key}={float(number)} is the position of that number" if found.size else ""
+        return None
+    positions = column.read().reshape(-1).astype(np.float64)
+    found = np.flatnonzero(np.isclose(positions, number, rtol=rtol, atol=0))
+    return int(found[0]) if found.size else None
 
 
 def _index_of_label(source: str, key: str, text: str, dimension: Dimension) -> int:
     column = dimension.column
-    labels = (
-        [] if column is None else [_text(value) for value in column.read().reshape(-1).tolist()]
-    )
+    values = [] if column is None else column.read().reshape(-1).tolist()
+    labels = [text_of(value).strip() for value in values]
     if text in labels:
         return labels.index(text)
-    try:
-        wanted = float(text)
-    except ValueError:
-        wanted = math.nan
-    if column is not None and column.numeric:
-        positions = column.read().reshape(-1).astype(np.float64)
-        found = np.flatnonzero(np.isclose(positions, wanted, rtol=1e-6, atol=0))
-        if found.size:
-            return int(found[0])
+    found = _place_of(float(text), dimension, rtol=1e-6) if is_number(text) else None
+    if found is not None:
+        return found
     listed = f", or one of {', '.join(labels[:8])}" if labels else ""
     raise InputError(
         f"{source}: --select {key}={text} is no index 0..{dimension.length - 1}{listed}"
     )
-
-
-def _text(value: Any) -> str:
-    return text_of(value).strip()

@@ -7,17 +7,19 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.cf import Packing
-from fhash_formats.readers.file_series import Request
+from fhash_formats.readers.file_series import RawLayout, Request
 from fhash_formats.readers.layout import (
     Dimension,
     arrange,
     is_asked,
     label,
+    left,
     must_select,
     picks,
     readings,
@@ -67,8 +69,7 @@ class Listed:
         axes = [axis for _, axis in self.dimensions]
         count = self.shape[axes.index("t")] if "t" in axes else 1
         if self.options and whole and not range(*steps.indices(count)):
-            problem = empty_selection(count)
-            return replace(self, options=(), problem=problem)
+            return replace(self, options=(), problem=empty_selection(count))
         parts = [steps.start, steps.stop] + ([] if steps.step is None else [steps.step])
         text = ":".join("" if part is None else str(part) for part in parts)
         return replace(self, options=tuple((*words, "--t", text) for words in self.options))
@@ -134,11 +135,9 @@ def listing(
         if not problem:
             said = ("--var", name) if several or request.var else ()
             try:
-                entry = (
-                    _as_stored(entry, variable, packed)
-                    if request.raw_values
-                    else _unpacked(entry, packed(variable))
-                )
+                # of raw values, attributes that make no sense are not used
+                with suppress(*[InputError] * request.raw_values):
+                    entry = _typed(entry, packed(variable), raw_values=request.raw_values)
                 entry = _read(source, entry, dimensions(variable), request, said)
             except InputError as error:  # of attributes that make no sense
                 entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
@@ -152,10 +151,13 @@ def _output(name: str, whole: bool) -> str:
     return re.sub(r"[*#\s]+", "", "".join(filter(str.isprintable, text))).strip("._") + ".fhz"
 
 
-def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
-    """An entry with the type of the values instead of the stored one, and the fill values."""
+def _typed(entry: Listed, packed: Packing | None, *, raw_values: bool) -> Listed:
+    """An entry with the type of the values and the fill values, or with the stored type."""
     if packed is None:
         return entry
+    if raw_values:  # counts have not the unit of the values
+        units = "" if packed.scaled else entry.units
+        return replace(entry, dtype=kind_of(packed.stored), units=units)
     # integers of which some are missing decode to integers again
     changed = packed.scaled and packed.dtype != packed.stored
     return replace(
@@ -164,20 +166,6 @@ def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
         stored=kind_of(packed.stored) if changed else "",
         missing=tuple(fill.item() for fill in packed.fills),
     )
-
-
-def _as_stored(
-    entry: Listed, variable: Variable, packed: Callable[[Variable], Packing | None]
-) -> Listed:
-    """An entry with the stored type; counts have not the unit of the values."""
-    try:
-        declared = packed(variable)
-    except InputError:  # the attributes make no sense, and are not used
-        return entry
-    if declared is None:
-        return entry
-    units = "" if declared.scaled else entry.units
-    return replace(entry, dtype=kind_of(declared.stored), units=units)
 
 
 def _read(
@@ -189,68 +177,52 @@ def _read(
 ) -> Listed:
     """An entry with its dimensions and the options of its readings."""
     names = [label(place, dimension) for place, dimension in enumerate(dimensions)]
-    said = (*named, *_given(request))
-    axes = ["?"] * len(dimensions)
+    axes, problem = ["?"] * len(dimensions), ""
+    options: tuple[tuple[str, ...], ...] = ()
     try:
-        picked = picks(source, entry.name, dimensions, request.select)
-        extra: list[int] = []
+        chosen = picks(source, entry.name, dimensions, request.select)
+        said = (*named, *_given(request))
         if request.axes is None:
-            picked |= single(dimensions, picked)
-            extra = must_select(dimensions, picked)
-        for place in {**picked, **dict.fromkeys(extra, 0)}:
+            chosen |= single(dimensions, chosen)
+            for place in must_select(dimensions, chosen):
+                chosen[place] = 0
+                said = (*said, "--select", f"{names[place]}=0")
+                request = replace(request, select=(*request.select, (names[place], "0")))
+        for place in chosen:
             axes[place] = "select"
-        chosen = {**picked, **dict.fromkeys(extra, 0)}
-        select = tuple(("--select", f"{names[place]}=0") for place in extra)
-        options = (*said, *(word for pair in select for word in pair))
         kept = [place for place in range(len(dimensions)) if place not in chosen]
-        if request.axes is None and is_asked(
-            dimensions, chosen, selected=bool(request.select or extra)
-        ):
-            both = readings(dimensions, [dimensions[place] for place in kept])
+        selected = bool(request.select)
+        if request.axes is None and is_asked(dimensions, chosen, selected=selected):
             for place in kept[:-1]:
                 axes[place] = dimensions[place].role or "?"
-            return replace(
-                entry,
-                dimensions=tuple(zip(names, axes, strict=True)),
-                options=tuple((*options, *text.split()) for text in both),
-            )
-        wishes = tuple((names[place], "0") for place in extra)
-        layout = arrange(
-            source, entry.name, dimensions, replace(request, select=(*request.select, *wishes))
-        )
+            both = readings(dimensions, left(dimensions, chosen))
+            options = tuple((*said, *text.split()) for text in both)
+        else:
+            layout = arrange(source, entry.name, dimensions, request)
+            for place, axis in zip(kept, layout.axes, strict=True):
+                axes[place] = axis
+            options = (said,)
     except InputError as error:
-        return replace(
-            entry,
-            dimensions=tuple(zip(names, axes, strict=True)),
-            problem=str(error).removeprefix(f"{source}: "),
-        )
-    for place, axis in zip(kept, layout.axes, strict=True):
-        axes[place] = axis
-    return replace(entry, dimensions=tuple(zip(names, axes, strict=True)), options=(options,))
+        problem = str(error).removeprefix(f"{source}: ")
+    told = tuple(zip(names, axes, strict=True))
+    return replace(entry, dimensions=told, options=options, problem=problem)
 
 
 def _given(request: Request) -> tuple[str, ...]:
     """The options that the user gave already, which the commands repeat."""
-    words: list[str] = []
-    if request.axes is not None:
-        words += ["--axes", ",".join(request.axes)]
-    for name, index in request.select:
-        words += ["--select", f"{name}={index}"]
-    if request.raw is not None:
-        raw = request.raw
-        if raw.shape is not None:
-            words += ["--shape", ",".join(f"{axis}={n}" for axis, n in raw.shape.items())]
-        if raw.dtype is not None:
-            words += ["--dtype", raw.dtype]
-        if raw.endian is not None:
-            words += ["--endian", raw.endian]
-    if request.raw_values:
-        words.append("--raw-values")
-    if request.overlap is not None:
-        words += ["--overlap", request.overlap]
-    for value in request.missing:
-        words += ["--missing", repr(value)]
-    return tuple(words)
+    raw = request.raw or RawLayout()
+    shape = raw.shape and ",".join(f"{axis}={n}" for axis, n in raw.shape.items())
+    pairs = [
+        ("--axes", request.axes and ",".join(request.axes)),
+        *(("--select", f"{name}={index}") for name, index in request.select),
+        ("--shape", shape),
+        ("--dtype", raw.dtype),
+        ("--endian", raw.endian),
+        ("--raw-values", "" if request.raw_values else None),
+        ("--overlap", request.overlap),
+        *(("--missing", repr(value)) for value in request.missing),
+    ]
+    return tuple(word for pair in pairs if pair[1] is not None for word in pair if word)
 
 
 def listed_series(series: Series, request: Request) -> Listed:

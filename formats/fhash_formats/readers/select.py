@@ -29,7 +29,6 @@ from fhash_formats.readers.cf import (
     real_time,
     role_of_coordinate,
     role_of_name,
-    texts_along,
     usable,
     written_times,
 )
@@ -37,8 +36,7 @@ from fhash_formats.readers.file_series import (
     FileSeries,
     FolderStamp,
     Request,
-    StoredFiles,
-    StoredValues,
+    Stored,
     refusing,
 )
 from fhash_formats.readers.layout import (
@@ -53,7 +51,6 @@ from fhash_formats.readers.listing import Listed, listing
 from fhash_formats.readers.stored_parts import not_stored, warn_of_column
 from fhash_formats.readers.surroundings import (
     MAX_ARRAYS,
-    Arranged,
     Wanted,
     is_small,
     metadata_of,
@@ -472,8 +469,7 @@ class Selection:
     def _texts(self, variable: Variable, dimension: Dimension) -> Coordinate | None:
         """Times that are texts along a dimension; None without."""
         near = [each for _, each in self._near(variable)]
-        texts = texts_along(dimension.name, dimension.length, near)
-        return written_times(dimension.name or AXIS_NAMES["t"], texts)
+        return written_times(dimension.name, dimension.length, near)
 
     def _scalars(
         self, variable: Variable, layout: Layout, coords: Mapping[str, Coordinate]
@@ -526,43 +522,45 @@ class Selection:
         default = None
         if fill is not None and packed is not None and not told:
             default = packed.unpack(np.array([fill], packed.stored))[0].item()
-        series = FileSeries(
-            files=StoredFiles(
-                source=self.source,
-                stamp=(None if variable.members else behind[0].stamp) or opened.stamp,
-                folder=None if folder is None else FolderStamp.of(folder),
-                close=opened.close,
-                beside=[*opened.files, *dict.fromkeys(n for each in behind for n in each.files)],
-            ),
-            name=plain_name(shown_name(variable.name, names)),
-            values=StoredValues(
-                shape=layout.shape,
-                dtype=dtype,
-                axes=layout.axes,
-                fetch=layout.fetch(self.reading(variable)),
-                chunks=layout.chunks(variable.chunks),
-                packing=None if opened.computed else packed,
-                not_stored=not_stored(parts, layout, joined=bool(variable.members)),
-                default_fill=default,
-            ),
-            coords=coords,
-            attributes=json_attributes(variable.attributes, without=without) | layout.attributes(),
+        stored = Stored(
+            source=self.source,
+            stamp=(None if variable.members else behind[0].stamp) or opened.stamp,
+            folder=None if folder is None else FolderStamp.of(folder),
+            close=opened.close,
+            beside=[*opened.files, *dict.fromkeys(n for each in behind for n in each.files)],
+            shape=layout.shape,
+            dtype=dtype,
+            axes=layout.axes,
+            fetch=layout.fetch(self.reading(variable)),
+            chunks=layout.chunks(variable.chunks),
+            packing=None if opened.computed else packed,
+            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+            default_fill=default,
         )
+        name = plain_name(shown_name(variable.name, names))
+        attributes = json_attributes(variable.attributes, without=without) | layout.attributes()
+        series = FileSeries(name, stored, coords, attributes)
         if not variable.members and not variable.field:
-            arranged = Arranged(layout=layout, request=request, packed=packed, coords=series.coords)
-            unfit = without if request.raw_values else ()
-            series.metadata = partial(self._metadata, variable, arranged, unfit)
+            unfit = without if request.raw_values else frozenset[str]()
+            series.metadata = partial(
+                self._metadata, variable, layout, packed, series.coords, unfit
+            )
         return series
 
     def _metadata(
-        self, variable: Variable, arranged: Arranged, without: Sequence[str] | frozenset[str]
+        self,
+        variable: Variable,
+        layout: Layout,
+        packed: Packing | None,
+        coords: Mapping[str, Coordinate],
+        without: frozenset[str],
     ) -> SourceMetadata | None:
         """All that belongs to a variable.
 
         None where its dimensions have no names and nothing but positions is beside it. They then
         have the names of the axes, and in what is beside it names of their own.
         """
-        layout, coords, opened = arranged.layout, arranged.coords, self.opened
+        opened = self.opened
         warn_left_out(f"{self.source}: not everything beside it is kept", opened.left_out)
         beside_it = self._beside(variable)
         taken = {plain_name(each.name) for each in coords.values()}
@@ -600,7 +598,8 @@ class Selection:
         groups = opened.groups
         of_file = groups.get(self._scope(variable)[0], {}) if opened.naming else groups.get("", {})
         with refusing(f"{self.source} cannot be read"):
-            return metadata_of(wanted, {own_name: whole, **arrays}, of_file, arranged)
+            known = {own_name: whole, **arrays}
+            return metadata_of(wanted, known, of_file, layout, self.request, packed, coords["t"])
 
     def _flat(self, variable: Variable, other: Variable) -> str:
         """A name without groups for what lies beside a variable, or for itself."""

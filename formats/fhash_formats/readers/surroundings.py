@@ -43,10 +43,6 @@ MAX_TEXTS = 1 << 14
 """Texts of one array; they stand in the header."""
 MAX_ARRAYS = 512
 """Number of arrays beside the data; a reader takes twice as many."""
-SMALL = 100
-"""An array of the file is small beside a variable that has more than so many times its bytes."""
-SMALL_BYTES = 1 << 10
-"""Bytes of an array that is small beside any variable."""
 MAX_TOLD = 12
 """Names in one warning."""
 MAX_ATTRIBUTE = 64 << 10
@@ -114,10 +110,8 @@ def named_dimensions(layout: Layout, coords: Mapping[str, Coordinate]) -> list[s
         f"dim_{place}" if place in layout.picked else coords[next(axes)].name
         for place in range(len(layout.dimensions))
     ]
-    return [
-        other if each.name is None else each.name
-        for each, other in zip(layout.dimensions, others, strict=True)
-    ]
+    pairs = zip(layout.dimensions, others, strict=True)
+    return [other if each.name is None else each.name for each, other in pairs]
 
 
 def surroundings(
@@ -166,35 +160,21 @@ def warn_left_out(what: str, left_out: Mapping[str, str]) -> None:
         warnings.warn(f"{what}: {', '.join(told[:MAX_TOLD])}{rest}", FhashWarning, stacklevel=3)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arranged:
-    """A variable as it is read.
-
-    Attributes:
-        layout: of its dimensions.
-        request: what the user asked for.
-        packed: how the values are packed; None where they are read as they are stored.
-        coords: positions of the axes; the times may stand for those of the file.
-    """
-
-    layout: Layout
-    request: Request
-    packed: Packing | None
-    coords: Mapping[str, Coordinate]
-
-
 def metadata_of(
     wanted: Wanted,
     variables: Mapping[str, Variable],
     attributes: Mapping[str, Any],
-    arranged: Arranged,
+    layout: Layout,
+    request: Request,
+    packed: Packing | None,
+    time: Coordinate,
 ) -> SourceMetadata:
     """All that belongs to a variable as it was arranged; see `surroundings`.
 
-    wanted: without dimensions.
+    wanted: without dimensions. packed: None where values are read as they are stored. time: of the
+    series, which may stand for that of the file.
     """
-    name, layout, packed = wanted.name, arranged.layout, arranged.packed
-    own, request = variables[name], arranged.request
+    name, own = wanted.name, variables[wanted.name]
     kept, picked = kept_dimensions(wanted.source, name, layout, own.names, request.select)
     wanted = replace(
         wanted,
@@ -204,8 +184,7 @@ def metadata_of(
         digested=request.digested,
     )
     selected = replace(own, attributes={**own.attributes, **layout.attributes()})
-    found = surroundings(wanted, {**variables, name: selected}, attributes)
-    return with_times(found, arranged.coords["t"])
+    return with_times(surroundings(wanted, {**variables, name: selected}, attributes), time)
 
 
 def digest_of(path: Path) -> str | None:
@@ -223,28 +202,23 @@ def _named(
     attributes: Mapping[str, Any],
 ) -> dict[str, bool]:
     """Names of all that belongs to a variable, in order, and whether each is a coordinate."""
-    names = {name: True for name in own.names}
-    names |= dict.fromkeys([*_texts(own.attributes, COORDINATES), *wanted.coordinates], True)
+    told = [*own.names, *_coordinates(own.attributes), *wanted.coordinates]
     # a coordinate that belongs to no variable alone, or to another one on the same vertices
-    everywhere = [each.attributes for each in variables.values()]
-    for name in (text for each in (attributes, *everywhere) for text in _texts(each, COORDINATES)):
-        if name in variables and set(variables[name].names) <= set(own.names):
-            names[name] = True
-    for name in [*_references(own), *wanted.used]:
-        names.setdefault(name, False)
-    names = {name: told for name, told in names.items() if name in variables}
-    names.pop(wanted.name, None)
-    open_names = list(names)
-    while open_names:
-        for name in _references(variables[open_names.pop(0)]):
-            if name in variables and name not in names and name != wanted.name:
-                names[name] = False
-                open_names.append(name)
+    for each in (attributes, *(each.attributes for each in variables.values())):
+        for name in _coordinates(each):
+            if name in variables and set(variables[name].names) <= set(own.names):
+                told.append(name)
+    names: dict[str, bool] = {}
+    waiting = [*told, *_references(own), *wanted.used]
+    for name in waiting:  # which grows
+        if name in variables and name != wanted.name and name not in names:
+            names[name] = name in told
+            waiting += _references(variables[name])
     return names
 
 
-def _texts(attributes: Mapping[str, Any], key: str) -> list[str]:
-    text = attributes.get(key)
+def _coordinates(attributes: Mapping[str, Any]) -> list[str]:
+    text = attributes.get(COORDINATES)
     return text.split() if isinstance(text, str) else []
 
 
@@ -268,22 +242,20 @@ class _Collected:
 
     def add(self, name: str, is_coordinate: bool) -> None:
         """Read a variable, or note why it is left out."""
-        problem = self._problem(name, self._stored[name])
+        stored, picked = self._stored[name], self._wanted.picked
+        kept = [n for n, each in enumerate(stored.names) if each not in picked]
+        dimensions = tuple(stored.names[n] for n in kept)
+        problem = self._problem(dimensions, [stored.shape[n] for n in kept], stored.dtype)
+        if not problem:
+            try:
+                read = stored.read(tuple(picked.get(each, slice(None)) for each in stored.names))
+                values = np.asarray(read)
+                problem = "" if stored_type(values) else f"values of type {values.dtype}"
+            except Exception as error:  # filters and files raise all kinds
+                problem = f"cannot be read: {condense(error)}"
         if problem:
             self._left_out[name] = problem
             return
-        stored, picked = self._stored[name], self._wanted.picked
-        try:
-            values = np.asarray(
-                stored.read(tuple(picked.get(each, slice(None)) for each in stored.names))
-            )
-        except Exception as error:  # filters and files raise all kinds
-            self._left_out[name] = f"cannot be read: {condense(error)}"
-            return
-        if stored_type(values) is None:
-            self._left_out[name] = f"values of type {values.dtype}"
-            return
-        dimensions = tuple(each for each in stored.names if each not in picked)
         self._bytes += size_of(values.shape, values.dtype)
         self._lengths |= dict(zip(dimensions, values.shape, strict=True))
         self.variables.append(
@@ -296,28 +268,22 @@ class _Collected:
             )
         )
 
-    def _problem(self, name: str, stored: Variable) -> str:
-        """Why a variable is left out, as far as is known before it is read; "" if it is not."""
-        kept = [
-            (each, length)
-            for each, length in zip(stored.names, stored.shape, strict=True)
-            if each not in self._wanted.picked
-        ]
-        names = [each for each, _ in kept]
-        shape = tuple(length for _, length in kept)
-        size = size_of(shape, stored.dtype)
+    def _problem(self, names: Sequence[str], shape: Sequence[int], dtype: np.dtype[Any]) -> str:
+        """Why an array is left out, as far as is known before it is read; "" if it is not."""
+        size = size_of(shape, dtype)
+        pairs = zip(names, shape, strict=True)
         if len(set(names)) < len(names):
             return "its dimensions have no form in all formats"
         if len(self.variables) == MAX_ARRAYS:
             return f"more than {MAX_ARRAYS} arrays"
-        if 0 in shape or any(self._lengths.get(each, length) != length for each, length in kept):
+        if 0 in shape or any(self._lengths.get(each, length) != length for each, length in pairs):
             return "its dimensions do not fit"
-        if stored.dtype.kind not in "iufSUTO" or stored.dtype.itemsize > 1 << 16:
-            return f"values of type {stored.dtype}"
+        if dtype.kind not in "iufSUTO" or dtype.itemsize > 1 << 16:
+            return f"values of type {dtype}"
         # of a plane, latitude and longitude have all dimensions
         if len(self._wanted.dimensions) > 2 and set(self._wanted.dimensions) <= set(names):
             return "a field of its own: it has all dimensions of the variable"
-        if stored.dtype.kind in "SUTO" and prod(shape) > MAX_TEXTS:
+        if dtype.kind in "SUTO" and prod(shape) > MAX_TEXTS:
             return f"{prod(shape)} texts; {MAX_TEXTS} are kept"
         if size > MAX_ONE:
             return f"{size / 2**20:.0f} MiB; {MAX_ONE >> 20} are kept"
@@ -327,8 +293,11 @@ class _Collected:
 
 
 def is_small(size: int, whole: int) -> bool:
-    """Whether an array is kept beside a variable that nothing ties it to; both in bytes."""
-    return SMALL * size < max(whole, SMALL * SMALL_BYTES)
+    """Whether an array is kept beside a variable that nothing ties it to; both in bytes.
+
+    It has less than a hundredth of its bytes, or than a KiB.
+    """
+    return size < max(whole / 100, 1 << 10)
 
 
 def size_of(shape: Sequence[int], dtype: np.dtype[Any]) -> int:

@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.readers.cf import Packing
 from fhash_formats.readers.file_series import FileSeries, Request, condense, refusing
 from fhash_formats.readers.layout import Layout, label
 from fhash_formats.readers.select import Selection
@@ -51,13 +50,10 @@ def open_coded(path: Path, request: Request) -> Iterator[tuple[FileSeries, Coded
         with refusing(f"{path} cannot be read as zarr"):
             found = Selection(opened, request)
             variable = found.choose()
-            packed = _require_coded(found, variable)
+            coding, fills = _require_coded(found, variable)
             layout = found.arrange(variable)
             series = found.series_of(variable, layout)
-        yield (
-            series,
-            CodedArray(found.source, variable, layout, () if packed is None else packed.fills),
-        )
+        yield series, CodedArray(found.source, variable, layout, coding, fills)
     finally:
         opened.close()
 
@@ -103,75 +99,66 @@ class _Coding:
 
 def _coding(array: zarr.Array[Any]) -> _Coding | str:
     """The codecs of an array, or why its chunks cannot be tiles."""
-    from zarr.codecs import ShardingCodec
+    from zarr.abc.codec import ArrayArrayCodec
+    from zarr.codecs import ShardingCodec, TransposeCodec
     from zarr.core.chunk_grids import RegularChunkGrid
+
+    from fhash_formats.transform.zarr_codec import TransformCodec
+
+    def named(codecs: Sequence[Any]) -> list[str]:
+        return [str(codec.to_dict()["name"]) for codec in codecs]
 
     if array.metadata.zarr_format != 3:
         return "is of Zarr format 2"
     if not isinstance(array.metadata.chunk_grid, RegularChunkGrid):
         return "has no regular grid of chunks"
     chunk = tuple(array.metadata.chunk_grid.chunk_shape)
-    codecs = tuple(array.metadata.codecs)
+    codecs: list[Any] = list(array.metadata.codecs)
     shard, at_end = None, True
     if len(codecs) == 1 and isinstance(codecs[0], ShardingCodec):
         sharding = codecs[0]
-        names = [str(codec.to_dict()["name"]) for codec in sharding.index_codecs]
+        names = named(sharding.index_codecs)
         if names != ["bytes", "crc32c"]:
             return f"has shards whose index is coded by {', '.join(names)}"
-        shard, chunk, codecs = chunk, tuple(sharding.chunk_shape), tuple(sharding.codecs)
+        shard, chunk, codecs = chunk, tuple(sharding.chunk_shape), list(sharding.codecs)
         at_end = sharding.index_location.value == "end"
-    return _inner_coding(codecs, chunk, shard, at_end)
-
-
-def _inner_coding(
-    codecs: Sequence[Any], chunk: Place, shard: Place | None, at_end: bool
-) -> _Coding | str:
-    """The codecs of the chunks of an array, or why they cannot be tiles."""
-    from zarr.abc.codec import ArrayArrayCodec
-    from zarr.codecs import TransposeCodec
-
-    from fhash_formats.transform.zarr_codec import TransformCodec
-
-    names = ", ".join(str(codec.to_dict()["name"]) for codec in codecs)
+    told = f"is coded by {', '.join(named(codecs))}"
     order = list(range(len(chunk)))
-    rest = list(codecs)
-    while rest and isinstance(rest[0], ArrayArrayCodec):
-        filtered = rest.pop(0)
+    while codecs and isinstance(codecs[0], ArrayArrayCodec):
+        filtered = codecs.pop(0)
         if not isinstance(filtered, TransposeCodec):
-            return f"is coded by {names}, of which a container has no filter"
+            return f"{told}, of which a container has no filter"
         order = [order[place] for place in filtered.order]
-    if not rest or not isinstance(rest[0], TransformCodec):
-        return f"is coded by {names}, not by fhash.transform"
+    if not codecs or not isinstance(codecs[0], TransformCodec):
+        return f"{told}, not by fhash.transform"
+    codec, *after = codecs
     return _Coding(
         order=tuple(order),
-        codec=rest[0],
-        after=tuple(rest[1:]),
+        codec=codec,
+        after=tuple(after),
         chunk=chunk,
         shard=shard,
         at_end=at_end,
     )
 
 
-def _require_coded(found: Selection, variable: Variable) -> Packing | None:
-    """The packing of a variable, whose chunks can be the tiles of a container.
+def _require_coded(found: Selection, variable: Variable) -> tuple[_Coding, tuple[Any, ...]]:
+    """The codecs of a variable whose chunks can be the tiles of a container, and its fill values.
 
     Raises InputError for another one.
     """
-    why = "has its steps in several groups" if variable.members else ""
-    if not why:
-        coding = _coding(variable.handle)
-        why = coding if isinstance(coding, str) else ""
-    if why:
-        raise InputError(_refusal(found.source, variable.name, why))
+    coding = "has its steps in several groups" if variable.members else _coding(variable.handle)
+    if isinstance(coding, str):
+        raise _refusal(found.source, variable.name, coding)
     packed = found.packing(variable)
     if packed is not None and (packed.scaled or packed.stored != variable.dtype):
-        why = "is packed (scale_factor, add_offset), so that its numbers are not its values"
-        raise InputError(_refusal(found.source, variable.name, why))
-    return packed
+        told = "is packed (scale_factor, add_offset), so that its numbers are not its values"
+        raise _refusal(found.source, variable.name, told)
+    return coding, () if packed is None else packed.fills
 
 
-def _refusal(source: str, name: str, why: str) -> str:
-    return (
+def _refusal(source: str, name: str, why: str) -> InputError:
+    return InputError(
         f"{source}: variable {name} {why}; it has to be coded again: "
         f"fhash encode {source} --var {name}"
     )
@@ -194,35 +181,42 @@ class CodedArray:
     """
 
     def __init__(
-        self, source: str, variable: Variable, layout: Layout, fills: Sequence[Any] = ()
+        self,
+        source: str,
+        variable: Variable,
+        layout: Layout,
+        coding: _Coding,
+        fills: tuple[Any, ...],
     ) -> None:
-        path, array = variable.name, variable.handle
-        coding = _coding(array)
-        assert isinstance(coding, _Coding), "the caller has looked"
-        self.name, self._source, self._path = variable.name, source, path
+        array = variable.handle
+        self.name, self._source = variable.name, source
         self._array, self._coding, self._layout = array, coding, layout
         self.dtype = np.dtype(array.dtype).newbyteorder("=")
-        self.fill, self.fills = self.dtype.type(array.fill_value), tuple(fills)
+        self.fill, self.fills = self.dtype.type(array.fill_value), fills
         places = [place for place in range(array.ndim) if place not in layout.picked]
         self._places = dict(zip(layout.axes, places, strict=True))
+        self._axis_of = dict(zip(places, layout.axes, strict=True))
         for place in layout.picked:
             if coding.chunk[place] != 1:
                 what = label(place, layout.dimensions[place])
                 why = f"has chunks of {coding.chunk[place]} along {what}, of which one is selected"
-                raise InputError(_refusal(source, self.name, why))
-        shape, tile = self._by_axis(array.shape), self._by_axis(coding.chunk)
-        self.shape: tuple[int, ...] = shape
-        self.tile: tuple[int, ...] = tile
-        self.grid = tuple(-(-n // length) for n, length in zip(shape, tile, strict=True))
-        if prod(tile) > MAX_TILE_VERTICES:
-            why = f"has chunks of {prod(tile):,} values; a container has {MAX_TILE_VERTICES:,}"
-            raise InputError(_refusal(source, self.name, why))
-        self.configuration = self._configuration()
+                raise _refusal(source, self.name, why)
+        self.shape, self.tile = self._by_axis(array.shape), self._by_axis(coding.chunk)
+        self.grid = tuple(-(-n // length) for n, length in zip(self.shape, self.tile, strict=True))
+        size = prod(self.tile)
+        if size > MAX_TILE_VERTICES:
+            why = f"has chunks of {size:,} values; a container has {MAX_TILE_VERTICES:,}"
+            raise _refusal(source, self.name, why)
+        settings, axes = coding.codec.settings, self._axes()
+        self.configuration: dict[str, Any] = {}
+        if settings is not None:
+            self.configuration["settings"] = settings.to_text()
+        if not axes.usual:
+            self.configuration["axes"] = list(axes.names)
         given = coding.codec.to_dict()["configuration"]
         assert isinstance(given, Mapping)
         names = ("max_error", "max_error_rel", "step")
-        alone = coding.codec.settings is None
-        self.quality = {name: given[name] for name in names if alone and name in given}
+        self.quality = {name: given[name] for name in names if settings is None and name in given}
         self._index = lru_cache(maxsize=SHARD_INDICES)(self._read_index)
 
     def stream(self, index: Sequence[int]) -> bytes | None:
@@ -258,21 +252,11 @@ class CodedArray:
 
     def _stored(self, index: Sequence[int]) -> Place:
         """Index of a chunk in the array of the store."""
-        by_axis = dict(zip(AXES, index, strict=True))
-        axes = {place: axis for axis, place in self._places.items()}
-        picked = self._layout.picked
+        by_axis, picked = dict(zip(AXES, index, strict=True)), self._layout.picked
         return tuple(
-            picked[place] if place in picked else by_axis[axes[place]]
+            picked[place] if place in picked else by_axis[self._axis_of[place]]
             for place in range(self._array.ndim)
         )
-
-    def _configuration(self) -> dict[str, Any]:
-        """The settings that all chunks share, and the axes where they are not the usual ones."""
-        codec = self._coding.codec
-        settings = codec.settings
-        shared = {} if settings is None else {"settings": settings.to_text()}
-        axes = self._axes()
-        return shared if axes.usual else {**shared, "axes": list(axes.names)}
 
     def _axes(self) -> ArrayAxes:
         """The axis of tiles for each of t, z, y and x.
@@ -286,16 +270,14 @@ class CodedArray:
             given = TILE_AXES[-len(coded) :] if blank <= 0 else ("t",) * blank + TILE_AXES
         chunk = self._coding.chunk
         found: dict[str, str] = {}
-        axes = {place: axis for axis, place in self._places.items()}
         for place, tile_axis in zip(coded, given, strict=True):
             if chunk[place] > 1:
                 if tile_axis in found.values() or tile_axis == NO_AXIS:
                     why = f"has chunks of {chunk}, several of whose axes the codec took as one"
-                    raise InputError(_refusal(self._source, self.name, why))
-                found[axes[place]] = tile_axis
+                    raise _refusal(self._source, self.name, why)
+                found[self._axis_of[place]] = tile_axis
         for axis in AXES:
-            free = [each for each in TILE_AXES if each not in found.values()]
-            if axis not in found and axis in free:
+            if axis not in found and axis in TILE_AXES and axis not in found.values():
                 found[axis] = axis
         for axis in AXES:
             if axis not in found:
@@ -314,10 +296,8 @@ class CodedArray:
         index = self._index(outer)
         if index is None:
             return None
-        number = int(
-            np.ravel_multi_index([i % n for i, n in zip(place, counts, strict=True)], counts)
-        )
-        offset, size = (int(n) for n in index[number])
+        inside = [i % n for i, n in zip(place, counts, strict=True)]
+        offset, size = (int(n) for n in index[np.ravel_multi_index(inside, counts)])
         if ABSENT in (offset, size):
             return None
         return self._read(outer, RangeByteRequest(offset, offset + size))

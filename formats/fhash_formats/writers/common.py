@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -102,25 +104,14 @@ def printable(text: str, instead: str = "_") -> str:
     return "".join(char if char.isprintable() else instead for char in text)
 
 
-def safe_name(name: str) -> str:
-    """A name that HDF5, NetCDF and Zarr take as one name; see `plain_form`."""
-    return plain_form(name, default="values")
+def safe_name(name: str, used: set[str] | None = None) -> str:
+    """A name that HDF5, NetCDF and Zarr take as one name; see `plain_form`.
 
-
-def safe_names(region: Region) -> tuple[str, dict[str, str]]:
-    """Names of the variable and of its coordinates by axis, all different."""
-    variable = safe_name(region.name)
-    used = {variable}
-    names = {}
-    for axis in AXES:
-        names[axis] = unused_name(region.coords[axis].name or axis, used)
-    return variable, names
-
-
-def unused_name(name: str, used: set[str]) -> str:
-    """A safe name that is not in use; it is put among those that are."""
-    unique = plain_form(name, used, default="values")
-    used.add(unique)
+    used: names that it must differ from; it is put among them.
+    """
+    unique = plain_form(name, used or (), default="values")
+    if used is not None:
+        used.add(unique)
     return unique
 
 
@@ -129,12 +120,7 @@ def variable_attributes(region: Region) -> dict[str, Any]:
 
     They are the region's own, its units, and its name where that had to be changed.
     """
-    kept = json_attributes(region.attributes, without=DROPPED)
-    if region.units:
-        kept["units"] = region.units
-    if safe_name(region.name) != region.name:
-        kept.setdefault("long_name", region.name)
-    return kept
+    return _named(region, json_attributes(region.attributes, without=DROPPED))
 
 
 def coordinate_attributes(axis: str, coordinate: Coordinate) -> dict[str, Any]:
@@ -154,10 +140,8 @@ def hdf5_value(value: Any) -> Any:
         return value.replace("\0", "")
     if isinstance(value, bool):
         return np.int8(value)  # NetCDF has no boolean
-    if isinstance(value, float):
-        return np.float64(value)
-    if isinstance(value, int) and -(2**63) <= value < 2**63:
-        return np.int64(value)
+    if isinstance(value, float) or (isinstance(value, int) and -(2**63) <= value < 2**63):
+        return np.array(value)[()]
     if isinstance(value, np.generic | np.ndarray):
         return value if value.dtype.kind in "iufSU" else hdf5_value(value.tolist())
     if isinstance(value, list) and value and len(value) * 8 <= ATTRIBUTE_BYTES:
@@ -194,10 +178,10 @@ def even_spacing(values: npt.NDArray[np.float64]) -> float | None:
 
 Frame = npt.NDArray[Any]
 Put = Callable[[int, Frame], None]
-Open = Callable[
-    [Sequence[Region], Sequence[Path], Sequence[Path]], AbstractContextManager[Sequence[Put]]
-]
-OpenOne = Callable[[Region, Sequence[Path], Sequence[Path]], AbstractContextManager[Put]]
+Puts = Sequence[Put]
+Paths = Sequence[Path]
+Regions = Sequence[Region]
+Opened = AbstractContextManager[Puts]
 
 CHUNK_BYTES = 16 * 2**20
 
@@ -209,39 +193,20 @@ class Writer:
     Attributes:
         name: name for messages.
         suffixes: suffixes of its outputs, lower case with the dot.
-        outputs: (path, region) -> every path that will be written, in the order in which they take
-            their names; raises InputError where the format cannot hold the region.
         open: (regions, outputs, temporaries) -> context manager that gives the functions for the
             frames; the temporaries stand for the outputs one by one. Safe names of regions differ.
+        outputs: (path, region) -> every path that will be written, in the order in which they take
+            their names; raises InputError where the format cannot hold the region.
         directory: whether the output is a directory.
         several: whether an output holds several variables; `outputs` then depends on none.
     """
 
     name: str
     suffixes: tuple[str, ...]
-    outputs: Callable[[Path, Region], list[Path]]
-    open: Open
+    open: Callable[[Regions, Paths, Paths], Opened]
+    outputs: Callable[[Path, Region], list[Path]] = lambda path, region: [path]
     directory: bool = False
     several: bool = False
-
-
-def of_one(open_one: OpenOne) -> Open:
-    """The `open` of a format whose outputs hold one variable."""
-
-    @contextmanager
-    def opened(
-        regions: Sequence[Region], outputs: Sequence[Path], temporaries: Sequence[Path]
-    ) -> Iterator[Sequence[Put]]:
-        (region,) = regions
-        with open_one(region, outputs, temporaries) as put:
-            yield [put]
-
-    return opened
-
-
-def one_output(path: Path, region: Region) -> list[Path]:
-    """The outputs of a format that writes only the path it is given."""
-    return [path]
 
 
 def little_endian(dtype: np.dtype[Any], *, half: bool = False) -> np.dtype[Any]:
@@ -320,17 +285,26 @@ class HeldFile(io.FileIO):
 
 
 @contextmanager
-def held_hdf5(path: Path, opening: Callable[[HeldFile], Any]) -> Iterator[tuple[HeldFile, Any]]:
-    """A new file at `path`, and the object that `opening` (h5py, h5netcdf) makes of it.
+def held_hdf5(
+    path: Path, opening: Callable[[HeldFile], Any], create: Callable[[Any], Puts]
+) -> Iterator[Puts]:
+    """The functions for the frames of a new file at `path`.
 
-    The object is closed before the file in every case.
+    opening: makes an object of the file (h5py, h5netcdf), which is closed before it in every case.
+    create: makes all but the values in that object, and the functions.
     """
     root = None
     with HeldFile(path) as file:
+
+        def held(put: Put, step: int, frame: Frame) -> None:
+            with file.calling():
+                put(step, frame)
+
         try:
             with file.calling():
                 root = opening(file)
-            yield file, root
+                puts = create(root)
+            yield [partial(held, put) for put in puts]
         finally:
             if root is not None:
                 with file.calling():
@@ -359,17 +333,41 @@ class Outline:
 
     @classmethod
     def of(cls, region: Region) -> Outline:
-        """The outline of a region."""
-        if region.metadata is not None:
-            return _as_in_source(region, region.metadata)
-        name, names = safe_names(region)
+        """The outline of a region, with the dimensions of its source, and all beside it."""
+        name, metadata = safe_name(region.name), region.metadata
+        if metadata is None:
+            used = {name}
+            metadata = SourceMetadata(
+                dimensions={safe_name(region.coords[a].name or a, used): a for a in AXES},
+                variable_attributes=variable_attributes(region),
+            )
+        by_axis = dict(zip(AXES, region.shape, strict=True))
+        lengths = {each: by_axis.get(axis, 1) for each, axis in metadata.dimensions.items()}
+        variables = [each for each in metadata.variables if each.name != name]
+        for each, axis in metadata.dimensions.items():
+            if axis == NO_AXIS or metadata.named(each) is not None:
+                continue
+            coordinate = region.coords[axis]
+            # of a source, positions may tell no more than that there are so many
+            numbers = np.arange(coordinate.values.size)
+            if region.metadata is None or not np.array_equal(coordinate.values, numbers):
+                position = SourceVariable(
+                    name=each,
+                    dimensions=(each,),
+                    values=coordinate.values,
+                    attributes=coordinate_attributes(axis, coordinate),
+                    is_coordinate=True,
+                )
+                variables.append(position)
+        for variable in variables:
+            lengths |= dict(zip(variable.dimensions, variable.values.shape, strict=True))
         return cls(
             name=name,
-            dimensions={names[axis]: axis for axis in AXES},
-            lengths={names[axis]: n for axis, n in zip(AXES, region.shape, strict=True)},
-            attributes=variable_attributes(region),
-            variables=tuple(_positions(region, axis, names[axis]) for axis in AXES),
-            file_attributes={},
+            dimensions=metadata.dimensions,
+            lengths=lengths,
+            attributes=_attributes(region, metadata, variables),
+            variables=tuple(variables),
+            file_attributes=_without(metadata.attributes, PLUMBING),
         )
 
     @property
@@ -384,131 +382,76 @@ class Outline:
 
     def slab(self, step: int, frame: npt.NDArray[Any]) -> tuple[Any, npt.NDArray[Any]]:
         """The index of a frame (z, y, x) in the variable, and the values that belong there."""
-        present = list(self.dimensions.values())
-        index = tuple(
-            step if axis == "t" else 0 if axis == NO_AXIS else slice(None) for axis in present
-        )
-        space = [axis for axis in AXES[1:] if axis in present]
-        values = frame.reshape(
-            [n for axis, n in zip(AXES[1:], frame.shape, strict=True) if axis in present]
-        )
-        order = [space.index(axis) for axis in present if axis in space]
-        return index, values.transpose(order)
+        present = self.dimensions.values()
+        index = tuple({"t": step, NO_AXIS: 0}.get(axis, slice(None)) for axis in present)
+        order = [AXES.index(axis) - 1 for axis in present if axis in AXES[1:]]
+        made_up = [place for place in range(frame.ndim) if place not in order]
+        values = frame.transpose([*made_up, *order])
+        return index, values.reshape(values.shape[len(made_up) :])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Beside:
-    """The rest of an output of several variables, each part once.
+def together(
+    outlines: Sequence[Outline],
+) -> tuple[dict[str, int], list[SourceVariable], dict[str, Any]]:
+    """The lengths, the arrays beside the variables and the attributes of a file of some outlines.
 
-    Attributes:
-        lengths: of every dimension.
-        variables: arrays that no outline is of.
-        attributes: of the file.
+    outlines: of different names. Raises InputError where two do not agree on a length or an array:
+    they cannot share an output.
     """
-
-    lengths: Mapping[str, int]
-    variables: tuple[SourceVariable, ...]
-    attributes: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, outlines: Sequence[Outline]) -> Beside:
-        """The rest of an output of some variables.
-
-        outlines: of different names. Raises InputError where two do not agree on a length or an
-        array: they cannot share an output.
-        """
-        lengths: dict[str, int] = {}
-        variables: dict[str, SourceVariable] = {}
-        attributes: dict[str, Any] = {}
-        names = [outline.name for outline in outlines]
-        for outline in outlines:
-            for name, length in outline.lengths.items():
-                if lengths.setdefault(name, length) != length:
-                    raise _apart(outline, f"{length} of {name}, another {lengths[name]}")
-            for each in outline.variables:
-                if each.name not in names and not _same(
-                    variables.setdefault(each.name, each), each
-                ):
-                    raise _apart(outline, f"another {each.name} than the one before")
-            attributes = {**outline.file_attributes, **attributes}
-        return cls(lengths=lengths, variables=tuple(variables.values()), attributes=attributes)
+    lengths: dict[str, int] = {}
+    variables: dict[str, SourceVariable] = {}
+    attributes: dict[str, Any] = {}
+    names = [outline.name for outline in outlines]
+    for outline in outlines:
+        differs = [
+            f"{length} of {name}, another {lengths[name]}"
+            for name, length in outline.lengths.items()
+            if lengths.setdefault(name, length) != length
+        ] + [
+            f"another {each.name} than the one before"
+            for each in outline.variables
+            if each.name not in names and not _same(variables.setdefault(each.name, each), each)
+        ]
+        if differs:
+            raise InputError(
+                f"variable {outline.name} has {differs[0]}; write the variables one by one"
+            )
+        attributes = {**outline.file_attributes, **attributes}
+    return lengths, list(variables.values()), attributes
 
 
 def _same(one: SourceVariable, other: SourceVariable) -> bool:
     """Whether two arrays beside variables have the same dimensions and values."""
-    if tuple(one.dimensions) != tuple(other.dimensions):
-        return False
     floats = one.values.dtype.kind == other.values.dtype.kind == "f"
-    return bool(np.array_equal(one.values, other.values, equal_nan=floats))
+    return tuple(one.dimensions) == tuple(other.dimensions) and np.array_equal(
+        one.values, other.values, equal_nan=floats
+    )
 
 
-def _apart(outline: Outline, what: str) -> InputError:
-    return InputError(f"variable {outline.name} has {what}; write the variables one by one")
-
-
-def _as_in_source(region: Region, metadata: SourceMetadata) -> Outline:
-    """The outline of a region whose source is known, with its dimensions and all beside it."""
-    name = safe_name(region.name)
-    by_axis = dict(zip(AXES, region.shape, strict=True))
-    lengths = {each: by_axis.get(axis, 1) for each, axis in metadata.dimensions.items()}
-    variables = [each for each in metadata.variables if each.name != name]
-    for each, axis in metadata.dimensions.items():
-        if axis != NO_AXIS and metadata.named(each) is None and _is_told(region, axis):
-            variables.append(_positions(region, axis, each))
-    for variable in variables:
-        lengths |= dict(zip(variable.dimensions, variable.values.shape, strict=True))
-    names = {each.name for each in variables}
-    attributes = _without_missing(metadata.variable_attributes, names)
-    listed = str(attributes.pop(COORDINATES, "")).split()
-    listed += [
-        each.name
-        for each in variables
-        if each.is_coordinate and each.name not in (*listed, *metadata.dimensions)
+def _attributes(
+    region: Region, metadata: SourceMetadata, beside: Sequence[SourceVariable]
+) -> dict[str, Any]:
+    """Attributes of a variable, which name no array that is not beside it."""
+    names = {each.name for each in beside}
+    told = list(references(metadata.variable_attributes))
+    missing = {key for key, name in told if name not in names}
+    kept = _without(metadata.variable_attributes, PLUMBING | PACKING | missing | {COORDINATES})
+    listed = [name for key, name in told if key == COORDINATES and name in names] + [
+        each.name for each in beside if each.is_coordinate and each.name not in metadata.dimensions
     ]
     if listed:
-        attributes[COORDINATES] = " ".join(listed)
+        kept[COORDINATES] = " ".join(dict.fromkeys(listed))
+    return _named(region, kept)
+
+
+def _named(region: Region, attributes: dict[str, Any]) -> dict[str, Any]:
+    """The attributes with the units of a region, and with its name where that had to be changed."""
     if region.units:
         attributes["units"] = region.units
-    if name != region.name:
+    if safe_name(region.name) != region.name:
         attributes.setdefault("long_name", region.name)
-    return Outline(
-        name=name,
-        dimensions=metadata.dimensions,
-        lengths=lengths,
-        attributes={key: value for key, value in attributes.items() if key not in PACKING},
-        variables=tuple(variables),
-        file_attributes=_without_plumbing(metadata.attributes),
-    )
+    return attributes
 
 
-def _is_told(region: Region, axis: str) -> bool:
-    """Whether positions of an axis tell more than that there are so many."""
-    values = region.coords[axis].values
-    return not np.array_equal(values, np.arange(values.size))
-
-
-def _positions(region: Region, axis: str, name: str) -> SourceVariable:
-    """The coordinate of an axis as float64."""
-    coordinate = region.coords[axis]
-    return SourceVariable(
-        name=name,
-        dimensions=(name,),
-        values=coordinate.values,
-        attributes=coordinate_attributes(axis, coordinate),
-        is_coordinate=True,
-    )
-
-
-def _without_missing(attributes: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
-    """Attributes without those that name variables which are not in the output."""
-    missing = {key for key, name in references(attributes) if name not in names}
-    kept = {key: value for key, value in attributes.items() if key not in missing - {COORDINATES}}
-    if COORDINATES in missing:
-        kept[COORDINATES] = " ".join(
-            name for key, name in references(attributes) if key == COORDINATES and name in names
-        )
-    return _without_plumbing(kept)
-
-
-def _without_plumbing(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in attributes.items() if key not in PLUMBING and key}
+def _without(attributes: Mapping[str, Any], names: AbstractSet[str]) -> dict[str, Any]:
+    return {key: value for key, value in attributes.items() if key and key not in names}

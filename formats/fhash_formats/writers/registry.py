@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.files import check_output, replacing_all
-from fhash_formats.writers.common import Frame, Put, Region, Writer, safe_name
+from fhash_formats.writers.common import Frame, Region, Writer, safe_name
 from fhash_formats.writers.labelled import HDF5, NETCDF, NPY, RAW, ZARR
 from fhash_formats.writers.vtk import VTK, VTKHDF
 
@@ -100,13 +100,9 @@ def save_regions(
         force: see `save_region`.
         sources: see `save_region`.
 
-    Returns:
-        The paths written.
-
     Raises:
         InputError: also for variables that cannot share an output, because they have one name, or,
             in NetCDF and Zarr, dimensions or arrays of one name that differ.
-        OutputError: see `save_region`.
     """
     target = Path(path)
     regions = [region for region, _ in variables]
@@ -122,16 +118,13 @@ def save_regions(
         writer.open(regions, outputs, temporaries) as puts,
     ):
         for (region, frames), put in zip(variables, puts, strict=True):
-            _put_all(region, iter(frames), put)
+            source, steps = iter(frames), region.shape[0]
+            for step in range(steps):
+                # no variable: the frame must be gone before the next one is made
+                put(step, _frame(region, source, step))
+            if _next(region, source) is not None:
+                raise InputError(f"region {region.name!r}: more frames than its {steps} steps")
     return outputs
-
-
-def _put_all(region: Region, source: Iterator[npt.NDArray[np.generic]], put: Put) -> None:
-    for step in range(region.shape[0]):
-        # no variable: the frame must be gone before the next one is made
-        put(step, _frame(region, source, step))
-    if _next(region, source) is not None:
-        raise InputError(f"region {region.name!r}: more frames than its {region.shape[0]} steps")
 
 
 def _writer(path: Path) -> Writer:
@@ -140,11 +133,8 @@ def _writer(path: Path) -> Writer:
         if suffix in writer.suffixes:
             return writer
     suffixes = ", ".join(suffix for writer in WRITERS for suffix in writer.suffixes)
-    raise InputError(
-        f"{path}: cannot write"
-        f" {f'the suffix {path.suffix!r}' if suffix else 'a name without a suffix'}; use one of"
-        f" {suffixes}"
-    )
+    what = f"the suffix {path.suffix!r}" if suffix else "a name without a suffix"
+    raise InputError(f"{path}: cannot write {what}; use one of {suffixes}")
 
 
 def _frame(region: Region, source: Iterator[npt.NDArray[np.generic]], step: int) -> Frame:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from html import escape
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,15 +20,17 @@ from fhash_formats.support.dates import DAY, FIRST_GREGORIAN, clock
 from fhash_formats.support.files import check_output, replacing
 from fhash_formats.writers.common import (
     Frame,
-    Put,
+    Opened,
+    Paths,
+    Puts,
     Region,
+    Regions,
     Writer,
     chunk_shape,
     even_spacing,
     hdf5_value,
     held_hdf5,
     little_endian,
-    of_one,
     printable,
     safe_name,
     write_frame,
@@ -34,13 +38,16 @@ from fhash_formats.writers.common import (
 from fhash_formats.writers.labelled import COMPRESSION
 
 SPACE = ("z", "y", "x")
+DOUBLE = np.dtype("<f8")
+Appended = tuple[npt.NDArray[Any], np.dtype[Any]]
 
 
 def _vti_outputs(path: Path, region: Region) -> list[Path]:
     suffix = path.suffix.lower()
     _check_grid(path, region, suffix)
     if suffix == ".pvd":
-        suffix = ".vti" if _is_even(region) else ".vtr"
+        even = all(even_spacing(region.coords[axis].values) is not None for axis in SPACE)
+        suffix = ".vti" if even else ".vtr"
     elif region.shape[0] == 1:
         return [path]
     if not path.name.isprintable():
@@ -49,67 +56,45 @@ def _vti_outputs(path: Path, region: Region) -> list[Path]:
             " another name"
         )
     digits = max(4, len(str(region.shape[0] - 1)))
-    steps = [
-        path.with_name(f"{path.stem}_{step:0{digits}d}{suffix}") for step in range(region.shape[0])
-    ]
-    return [*steps, path.with_suffix(".pvd")]
-
-
-def _is_even(region: Region) -> bool:
-    return all(even_spacing(region.coords[axis].values) is not None for axis in SPACE)
+    names = [f"{path.stem}_{step:0{digits}d}{suffix}" for step in range(region.shape[0])]
+    return [*map(path.with_name, names), path.with_suffix(".pvd")]
 
 
 def _check_grid(path: Path, region: Region, suffix: str) -> None:
     """Raise InputError where the coordinates do not fit the format."""
-    _check_times(path, region)
-    for axis in SPACE:
-        values = region.coords[axis].values
-        if suffix == ".vti" and even_spacing(values) is None:
-            raise InputError(
-                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly"
-                " spaced, as .vti needs; use .vtr"
-            )
-        steps = np.diff(values)
-        if not np.all(np.isfinite(values)) or not (np.all(steps > 0) or np.all(steps < 0)):
-            raise InputError(
-                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} neither ascends"
-                " nor descends; use .nc, .h5 or .npy"
-            )
-
-
-def _check_times(path: Path, region: Region) -> None:
-    """Raise InputError for times that are not all finite."""
     if not np.all(np.isfinite(region.coords["t"].values)):
         raise InputError(
             f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
         )
+    for axis in SPACE:
+        values = region.coords[axis].values
+        steps, why = np.diff(values), ""
+        if suffix in (".vti", ".vtkhdf") and even_spacing(values) is None:
+            why = f"is not evenly spaced, as {suffix} needs; use .vtr or .pvd"
+        elif not np.all(np.isfinite(values)) or not (np.all(steps > 0) or np.all(steps < 0)):
+            why = "neither ascends nor descends; use .nc, .h5 or .npy"
+        if why:
+            raise InputError(f"{path}: the coordinate {region.coords[axis].name!r} of {axis} {why}")
 
 
 @contextmanager
-def _open_vti(
-    region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
-) -> Iterator[Put]:
+def _open_vti(regions: Regions, outputs: Paths, temporaries: Paths) -> Iterator[Puts]:
+    (region,) = regions
     ascending, turn = _turned(region)
     image = outputs[0].suffix.lower() == ".vti"
+    time = region.coords["t"]
 
     def put(step: int, frame: Frame) -> None:
-        _write_grid(
-            temporaries[step],
-            region,
-            _time_field(region.coords["t"], step),
-            ascending,
-            frame[turn],
-            image=image,
-        )
+        told = _time_field(float(time.values[step]), _time_units(time))
+        with temporaries[step].open("xb") as handle:
+            _write_grid(handle, region, told, ascending, frame[turn], image=image)
 
-    yield put
+    yield [put]
     if len(outputs) > region.shape[0]:
         temporaries[-1].write_text(_collection(region, outputs[:-1]), encoding="utf-8")
 
 
-def _turned(
-    region: Region,
-) -> tuple[dict[str, npt.NDArray[np.float64]], tuple[slice, ...]]:
+def _turned(region: Region) -> tuple[dict[str, npt.NDArray[np.float64]], tuple[slice, ...]]:
     """Positions of each axis of space, ascending, and the slices that turn a frame likewise."""
     given = {axis: region.coords[axis].values for axis in SPACE}
     turn = {
@@ -120,10 +105,10 @@ def _turned(
 
 
 def _write_grid(
-    path: Path,
+    handle: BinaryIO,
     region: Region,
     time: str,
-    coords: dict[str, npt.NDArray[np.float64]],
+    coords: Mapping[str, npt.NDArray[np.float64]],
     frame: Frame,
     *,
     image: bool,
@@ -134,54 +119,58 @@ def _write_grid(
     """
     dtype = little_endian(region.dtype)
     extent = " ".join(f"0 {length - 1}" for length in reversed(frame.shape))
+    arrays = [(frame, dtype), *((coords[axis][None], DOUBLE) for axis in "xyz" if not image)]
+    offsets = _offsets(arrays)
     kind, place = "RectilinearGrid", ""
+    grid = "".join(
+        f'<DataArray type="Float64" Name="{axis}" format="appended" offset="{offset}"/>'
+        for axis, offset in zip("xyz", offsets[1:], strict=False)
+    )
     if image:
         origin = " ".join(repr(float(coords[axis][0])) for axis in "xyz")
         spacing = " ".join(repr(even_spacing(coords[axis])) for axis in "xyz")
         kind, place = "ImageData", f' Origin="{origin}" Spacing="{spacing}"'
     name = f'"{escape(printable(region.name))}"'
-    units = _units(region.units)
-    sizes = (
-        [frame.size * dtype.itemsize]
-        if image
-        else [frame.size * dtype.itemsize, *(coords[axis].nbytes for axis in "xyz")]
-    )
-    # Each array follows its 64-bit size.
-    offsets = [sum(sizes[:i]) + 8 * i for i in range(len(sizes))]
-    grid = ""
-    if not image:
-        axes = zip("xyz", offsets[1:], strict=True)
-        grid = f"<Coordinates>{''.join(_axis(axis, offset) for axis, offset in axes)}</Coordinates>"
-    text = f"""<?xml version="1.0" encoding="UTF-8"?>
-<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">
-<{kind} WholeExtent="{extent}"{place}>
+    number = dtype.name.replace("uint", "UInt").replace("int", "Int").replace("float", "Float")
+    values = f'type="{number}" Name={name} format="appended" offset="0"'
+    body = f"""<{kind} WholeExtent="{extent}"{place}>
 <FieldData>{time}</FieldData>
 <Piece Extent="{extent}">
 <PointData Scalars={name}>
-<DataArray type="{_vtk_type(dtype)}" Name={name} format="appended" offset="0">{units}</DataArray>
+<DataArray {values}>{_units(region.units)}</DataArray>
 </PointData>
 <CellData></CellData>
-{grid}
+{f"<Coordinates>{grid}</Coordinates>" if grid else ""}
 </Piece>
-</{kind}>
+</{kind}>"""
+    _write_document(handle, kind, body, arrays)
+
+
+def _offsets(arrays: Sequence[Appended]) -> list[int]:
+    """Places of arrays that follow a document, each behind its 64-bit size."""
+    sizes = (8 + values.size * dtype.itemsize for values, dtype in arrays)
+    return list(accumulate(sizes, initial=0))[:-1]
+
+
+def _write_document(handle: BinaryIO, kind: str, body: str, arrays: Sequence[Appended]) -> None:
+    """Write a document of VTK, and the arrays that follow it."""
+    head = f"""<?xml version="1.0" encoding="UTF-8"?>
+<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">
+{body}
 <AppendedData encoding="raw">
 _"""
-    with path.open("xb") as handle:
-        handle.write(text.encode())
-        handle.write(sizes[0].to_bytes(8, "little"))
-        write_frame(handle, frame, dtype)
-        for axis, size in zip("xyz", sizes[1:], strict=False):
-            handle.write(size.to_bytes(8, "little"))
-            handle.write(coords[axis].astype("<f8").tobytes())
-        handle.write(b"\n</AppendedData>\n</VTKFile>\n")
+    handle.write(head.encode())
+    for values, dtype in arrays:
+        handle.write((values.size * dtype.itemsize).to_bytes(8, "little"))
+        write_frame(handle, values, dtype)
+    handle.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-def _time_field(coordinate: Coordinate, step: int) -> str:
+def _time_field(time: float, units: str = "") -> str:
     """The field array TimeValue, by which VTK's programs know the time of a file."""
     value = 'type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii"'
-    time = float(coordinate.values[step])
     # Information keys stand behind data that are written as text.
-    return f"<DataArray {value}>{time!r}{_units(_time_units(coordinate))}</DataArray>"
+    return f"<DataArray {value}>{time!r}{_units(units)}</DataArray>"
 
 
 def _time_units(coordinate: Coordinate) -> str:
@@ -202,15 +191,6 @@ def _units(text: str) -> str:
     return f"{key}{escape(printable(text))}</InformationKey>" if text else ""
 
 
-def _axis(axis: str, offset: int) -> str:
-    return f'<DataArray type="Float64" Name="{axis}" format="appended" offset="{offset}"/>'
-
-
-def _vtk_type(dtype: np.dtype[Any]) -> str:
-    """VTK's name of a type: Float32, UInt8 and so on."""
-    return dtype.name.replace("uint", "UInt").replace("int", "Int").replace("float", "Float")
-
-
 def _collection(region: Region, files: Sequence[Path]) -> str:
     # Here, because it imports urllib.request, which takes 30 ms of the start of every command.
     from xml.sax.saxutils import quoteattr
@@ -227,112 +207,73 @@ def _collection(region: Region, files: Sequence[Path]) -> str:
     return head + "".join(rows) + "</Collection>\n</VTKFile>\n"
 
 
-VTK = Writer(
-    name="VTK", suffixes=(".vti", ".vtr", ".pvd"), outputs=_vti_outputs, open=of_one(_open_vti)
-)
-
-
-SINGLE_VERSION = (1, 0)
-"""Version of a file of one step."""
-
-SERIES_VERSION = (2, 0)
-"""Version of a file of several steps; it is the first with a group Steps."""
-
-SERIES_NEEDS = "ParaView 5.12 or newer, as every .vtkhdf of several steps"
-"""Programs that read a file of several steps, for messages."""
+VTK = Writer(name="VTK", suffixes=(".vti", ".vtr", ".pvd"), open=_open_vti, outputs=_vti_outputs)
 
 
 def needed_by(paths: Sequence[str], steps: int) -> list[str]:
     """Programs that open outputs of so many steps: at most one text, for a .vtkhdf series."""
     series = steps > 1 and any(path.lower().endswith(".vtkhdf") for path in paths)
-    return [SERIES_NEEDS] if series else []
+    return ["ParaView 5.12 or newer, as every .vtkhdf of several steps"] if series else []
 
 
 def _vtkhdf_outputs(path: Path, region: Region) -> list[Path]:
-    _check_times(path, region)
-    for axis in SPACE:
-        if not even_spacing(region.coords[axis].values):
-            raise InputError(
-                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly"
-                " spaced, as .vtkhdf needs; use .vtr or .pvd"
-            )
+    _check_grid(path, region, ".vtkhdf")
     return [path]
 
 
-@contextmanager
-def _open_vtkhdf(
-    region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
-) -> Iterator[Put]:
+def _open_vtkhdf(regions: Regions, outputs: Paths, temporaries: Paths) -> Opened:
     import h5py
 
-    steps = region.shape[0]
-    turn = _turned(region)[1]
-    # Links in the order of their creation, as the reader of VTK demands for composite files and
-    # takes for all.
-    with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w", track_order=True)) as (
-        file,
-        root,
-    ):
-        with file.calling():
-            values = _create(root, region)
+    def opening(file: Any) -> Any:
+        # Links in the order of their creation, as the reader of VTK demands for composite files
+        # and takes for all.
+        return h5py.File(file, "w", track_order=True)
 
-        def put(step: int, frame: Frame) -> None:
-            with file.calling():
-                values[step if steps > 1 else ...] = frame[turn]
-
-        yield put
+    return held_hdf5(temporaries[0], opening, partial(_create, *regions))
 
 
-def _create(root: Any, region: Region) -> Any:
+def _create(region: Region, root: Any) -> Puts:
     """Create the empty dataset in `root`, with everything that describes it."""
-    ascending = _turned(region)[0]
+    ascending, turn = _turned(region)
     steps, *size = region.shape
+    several = steps > 1
     group = root.create_group("VTKHDF", track_order=True)
-    group.attrs["Version"] = np.array(SERIES_VERSION if steps > 1 else SINGLE_VERSION, dtype="<i8")
+    # 2.0 is the first version with a group Steps
+    group.attrs["Version"] = np.array((2 if several else 1, 0), dtype="<i8")
     group.attrs["Type"] = np.bytes_("ImageData")
-    group.attrs["WholeExtent"] = np.array(
-        [bound for length in reversed(size) for bound in (0, length - 1)], dtype="<i8"
-    )
-    group.attrs["Origin"] = np.array([ascending[axis][0] for axis in "xyz"], dtype="<f8")
-    group.attrs["Spacing"] = np.array(
-        [even_spacing(ascending[axis]) for axis in "xyz"], dtype="<f8"
-    )
+    extent = [bound for length in reversed(size) for bound in (0, length - 1)]
+    group.attrs["WholeExtent"] = np.array(extent, dtype="<i8")
+    positions = [ascending[axis] for axis in "xyz"]
+    group.attrs["Origin"] = np.array([each[0] for each in positions])
+    group.attrs["Spacing"] = np.array([even_spacing(each) for each in positions], dtype="<f8")
     group.attrs["Direction"] = np.eye(3, dtype="<f8").ravel()
     name = safe_name(region.name)
     points = group.create_group("PointData", track_order=True)
     points.attrs["Scalars"] = np.bytes_(name.encode())
     values = points.create_dataset(
         name,
-        shape=region.shape if steps > 1 else region.shape[1:],
+        shape=region.shape if several else region.shape[1:],
         dtype=little_endian(region.dtype),
-        chunks=chunk_shape(region) if steps > 1 else chunk_shape(region)[1:],
+        chunks=chunk_shape(region) if several else chunk_shape(region)[1:],
         **COMPRESSION,
     )
     if region.units:
         values.attrs["units"] = region.units.replace("\0", "")
-    times = region.coords["t"].values.astype("<f8")
-    if steps == 1:
-        holder = group.create_group("FieldData", track_order=True)
-        _describe(holder.create_dataset("TimeValue", data=times), region)
-        return values
-    series = group.create_group("Steps", track_order=True)
-    series.attrs["NSteps"] = np.int64(steps)
-    _describe(series.create_dataset("Values", data=times), region)
-    offsets = series.create_group("PointDataOffsets", track_order=True)
-    offsets.create_dataset(name, data=np.arange(steps, dtype="<i8"))
-    return values
-
-
-def _describe(times: Any, region: Region) -> None:
-    """Give a dataset of times the units and the calendar of the region's."""
+    time = region.coords["t"]
+    holder = group.create_group("Steps" if several else "FieldData", track_order=True)
+    if several:
+        holder.attrs["NSteps"] = np.int64(steps)
+    times = holder.create_dataset("Values" if several else "TimeValue", data=time.values)
     for key in ("units", "calendar"):
-        if key in region.coords["t"].attributes:
-            times.attrs[key] = hdf5_value(str(region.coords["t"].attributes[key]))
+        if key in time.attributes:
+            times.attrs[key] = hdf5_value(str(time.attributes[key]))
+    if several:
+        offsets = holder.create_group("PointDataOffsets", track_order=True)
+        offsets.create_dataset(name, data=np.arange(steps, dtype="<i8"))
+    return [lambda step, frame: values.__setitem__(step if several else ..., frame[turn])]
 
 
-VTKHDF = Writer(
-    name="VTKHDF", suffixes=(".vtkhdf",), outputs=_vtkhdf_outputs, open=of_one(_open_vtkhdf)
-)
+VTKHDF = Writer(name="VTKHDF", suffixes=(".vtkhdf",), open=_open_vtkhdf, outputs=_vtkhdf_outputs)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -405,15 +346,14 @@ def _write_ply(handle: BinaryIO, mesh: Mesh) -> None:
 
 def _write_vtp(handle: BinaryIO, mesh: Mesh) -> None:
     name = f'"{escape(printable(mesh.name))}"'
+    ends = np.arange(3, 3 * len(mesh.triangles) + 1, 3)
     arrays = [
-        np.full(len(mesh.vertices), mesh.value, dtype="<f8"),
-        mesh.vertices.astype("<f8"),
-        mesh.triangles.astype("<i8"),
-        np.arange(3, 3 * len(mesh.triangles) + 1, 3, dtype="<i8"),
+        (np.full((1, len(mesh.vertices)), mesh.value), DOUBLE),
+        (mesh.vertices[None], DOUBLE),
+        (mesh.triangles[None], np.dtype("<i8")),
+        (ends[None], np.dtype("<i8")),
     ]
-    offsets = [sum(array.nbytes + 8 for array in arrays[:number]) for number in range(len(arrays))]
-    value = 'type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii"'
-    time = f"<DataArray {value}>{mesh.time!r}</DataArray>"
+    offsets = _offsets(arrays)
     counts = (
         f'NumberOfPoints="{len(mesh.vertices)}" NumberOfVerts="0" NumberOfLines="0"'
         f' NumberOfStrips="0" NumberOfPolys="{len(mesh.triangles)}"'
@@ -423,10 +363,8 @@ def _write_vtp(handle: BinaryIO, mesh: Mesh) -> None:
         'type="Float64" Name="Points" NumberOfComponents="3"'
         f' format="appended" offset="{offsets[1]}"'
     )
-    text = f"""<?xml version="1.0" encoding="UTF-8"?>
-<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
-<PolyData>
-<FieldData>{time}</FieldData>
+    body = f"""<PolyData>
+<FieldData>{_time_field(mesh.time)}</FieldData>
 <Piece {counts}>
 <PointData Scalars={name}><DataArray {values}/></PointData>
 <Points><DataArray {points}/></Points>
@@ -435,14 +373,8 @@ def _write_vtp(handle: BinaryIO, mesh: Mesh) -> None:
 <DataArray type="Int64" Name="offsets" format="appended" offset="{offsets[3]}"/>
 </Polys>
 </Piece>
-</PolyData>
-<AppendedData encoding="raw">
-_"""
-    handle.write(text.encode())
-    for array in arrays:
-        handle.write(array.nbytes.to_bytes(8, "little"))
-        handle.write(array.tobytes())
-    handle.write(b"\n</AppendedData>\n</VTKFile>\n")
+</PolyData>"""
+    _write_document(handle, "PolyData", body, arrays)
 
 
 MESH_SUFFIXES: dict[str, Callable[[BinaryIO, Mesh], None]] = {

@@ -85,6 +85,14 @@ def test_scale_offset_and_every_fill_value_are_used() -> None:
     )
 
 
+@pytest.mark.parametrize("stored", ["f4", ">f4"])
+def test_floats_are_scaled_too_where_the_scale_is_of_their_type(stored: str) -> None:
+    attributes = {"_FillValue": np.float32(9), "scale_factor": np.float32(3)}
+    made = packing("a", np.dtype(stored), attributes)
+    values = made.unpack(np.array([1, 9, 3], stored))
+    np.testing.assert_array_equal(values, np.array([3, np.nan, 9], "f4"), strict=True)
+
+
 @pytest.mark.parametrize("written", ["NaN", "AAAAAAAA+H8=", float("nan")])
 def test_a_fill_value_of_nan_marks_itself(written: object) -> None:
     assert packing("a", np.dtype("f4"), {"_FillValue": written}).fills == ()
@@ -445,7 +453,7 @@ def test_a_stamp_of_a_folder_tells_any_change_below_it(tmp_path: Path) -> None:
     assert (stamp.files, stamp.size) == (1, 5)
     stamp.check()
     os.utime(file, ns=(1, 1))
-    with pytest.raises(InputError, match="something in it was written again"):
+    with pytest.raises(InputError, match="same size, written again"):
         stamp.check()
     (tmp_path / "b").write_bytes(b"6")
     with pytest.raises(InputError, match="1 files and 5 bytes before, 2 and 6 now"):

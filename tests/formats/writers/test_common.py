@@ -26,7 +26,6 @@ from fhash_formats.writers.common import (
     even_spacing,
     hdf5_value,
     safe_name,
-    safe_names,
     variable_attributes,
 )
 from fhash_formats.writers.registry import save_region
@@ -119,10 +118,9 @@ def test_safe_names(name: str, safe: str) -> None:
     ],
 )
 def test_all_names_of_a_file_differ(names: Any, expected: str) -> None:
-    variable, found = safe_names(region(names=names))
-    assert variable == "wind"
-    assert list(found) == ["t", "z", "y", "x"]
-    assert list(found.values()) == expected.split()
+    outline = Outline.of(region(names=names))
+    assert outline.name == "wind"
+    assert outline.dimensions == dict(zip(expected.split(), "tzyx", strict=True))
 
 
 def test_no_attribute_that_changes_the_values_is_kept() -> None:
