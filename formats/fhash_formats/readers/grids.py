@@ -1,4 +1,4 @@
-"""Readers of volumes behind a short header: NIfTI, MRC, OpenDX, legacy VTK and SEG-Y."""
+"""Readers of volumes behind a short header: NIfTI, MRC, OpenDX, cube, legacy VTK and SEG-Y."""
 
 from __future__ import annotations
 
@@ -309,6 +309,48 @@ def _dx_numbers(text: str, key: str) -> list[list[float]]:
     """The three numbers of each line of a key."""
     found = re.findall(rf"\b{key}\s+({DX_NUMBER}\s+{DX_NUMBER}\s+{DX_NUMBER})", text)
     return [numbers_of(each, 3).tolist() for each in found]
+
+
+CUBE_SUFFIXES = (".cube", ".cub")
+
+
+def is_cube(head: bytes, path: Path) -> bool:
+    """Whether this is a cube file of Gaussian, by its suffix: its first lines are any text."""
+    return path.suffix.lower() in CUBE_SUFFIXES
+
+
+def open_cube(path: Path, request: Request) -> Source:
+    """The density of a cube file, or its orbitals by their numbers (`NAME.17`); z is the fastest.
+
+    Positions are in bohr, in angstrom where the counts are negative. Raises InputError for grids
+    that are turned, and files that are cut.
+    """
+    stamp = Stamp.of(path)
+    with naming(str(path)), path.open("rb") as file:
+        lines = [decoded_text(file.readline(MAX_LINE)).split() for _ in range(6)]
+        rows = np.stack([numbers_of(" ".join(each[:4]), 4) for each in lines[2:]])
+        if not np.isfinite(rows).all() or not rows[1:, 0].all():
+            raise InputError("its grid has numbers that are not finite, or no vertices")
+        sizes, steps = np.abs(rows[1:, 0]).astype(int).tolist(), axis_steps(rows[1:, 1:])
+        atoms = int(rows[0, 0])
+        orbitals = [str(n) for n in range(int(lines[2][4]) if len(lines[2]) > 4 else 1)]
+        for _ in range(min(abs(atoms), path.stat().st_size)):
+            file.readline(MAX_LINE)
+        if atoms < 0:  # numbers of orbitals, and how many there are
+            words = file.readline(MAX_LINE).split()
+            while len(words) <= int(words[0]) and (line := file.readline(MAX_LINE)):
+                words += line.split()
+            orbitals = [decoded_text(each) for each in words[1:]]
+        shape = (*sizes, len(orbitals)) if len(orbitals) != 1 else tuple(sizes)
+        values = _values_at(path, file, shape, np.dtype(np.float64), is_text=True)
+    unit = "bohr" if rows[1, 0] > 0 else "angstrom"
+    coords = {
+        axis: lattice(axis, rows[0, n + 1], steps[n], sizes[n], units=unit)
+        for n, axis in enumerate("xyz")
+    }
+    whole = values.variable(path.stem, "xyz")
+    arrays = components(whole, 3, orbitals) if len(orbitals) != 1 else [whole]
+    return file_source(path, placed(arrays, coords), stamp=stamp)
 
 
 def _values_at(

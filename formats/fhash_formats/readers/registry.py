@@ -84,6 +84,7 @@ REGISTRY = (
     Reader("NIfTI", grids.NIFTI_SUFFIXES, grids.is_nifti, grids.open_nifti),
     Reader("MRC", grids.MRC_SUFFIXES, grids.is_mrc, grids.open_mrc),
     Reader("OpenDX", grids.DX_SUFFIXES, grids.is_dx, grids.open_dx),
+    Reader("cube", grids.CUBE_SUFFIXES, grids.is_cube, grids.open_cube),
     Reader("legacy VTK", grids.LEGACY_SUFFIXES, grids.is_legacy_vtk, grids.open_legacy_vtk),
     Reader("TIFF", tiff.SUFFIXES, tiff.matches, tiff.open_tiff),
     Reader("SEG-Y", grids.SEGY_SUFFIXES, grids.is_segy, grids.open_segy),

@@ -104,6 +104,45 @@ def test_mrc_of_other_axes_and_starts(tmp_path: Path) -> None:
     assert ends == {"t": [0], "z": [-6, -3], "y": [0, 2], "x": [0, 1]}
 
 
+def cube(path: Path, orbitals: int = 1, *, sign: int = 1) -> np.ndarray:
+    """A cube file as Gaussian writes it; its values (orbitals, x, y, z)."""
+    values = np.stack([VALUES[0].T.astype("f8") * (n + 1) for n in range(orbitals)])
+    atoms = 2 if orbitals == 1 else -2
+    lines = ["a density", "made by hand", f"{atoms:5d} 1.000000 2.000000 3.000000"]
+    for n, length in enumerate(values.shape[1:]):
+        lines.append(f"{sign * length:5d}" + "".join(f"{0.5 * (n == m):12.6f}" for m in range(3)))
+    lines += ["    8    0.0    0.1    0.2    0.3", "    1    0.0    1.1    0.2    0.3"]
+    if orbitals > 1:
+        lines += [f"{orbitals:5d}" + "".join(f"{n:5d}" for n in range(2)), "    2"]
+    rows = np.moveaxis(values, 0, -1).reshape(values.shape[1] * values.shape[2], -1)
+    for row in rows.tolist():
+        for first in range(0, len(row), 6):
+            lines.append("".join(f"{each:13.5E}" for each in row[first : first + 6]))
+    path.write_text("\n".join(lines) + "\n")
+    return values
+
+
+def test_cube_of_a_density(tmp_path: Path) -> None:
+    expected = cube(tmp_path / "a.cube")
+    values, ends, units = positions(tmp_path / "a.cube")
+    np.testing.assert_allclose(values[0], expected[0].T, rtol=1e-5)
+    assert ends == {"t": [0], "z": [3, 3.5], "y": [2, 2.5], "x": [1, 1.5]}
+    assert units == ["", "bohr", "bohr", "bohr"]
+    data = (tmp_path / "a.cube").read_bytes()
+    for end in range(0, len(data) - 14, 37):
+        (tmp_path / "a.cube").write_bytes(data[:end])
+        with pytest.raises(InputError):
+            positions(tmp_path / "a.cube")
+
+
+def test_cube_of_orbitals_in_angstrom(tmp_path: Path) -> None:
+    expected = cube(tmp_path / "a.cube", 3, sign=-1)
+    assert [each.name for each in list_variables(tmp_path / "a.cube")] == ["a.0", "a.1", "a.2"]
+    values, _, units = positions(tmp_path / "a.cube", var="a.2")
+    np.testing.assert_allclose(values[0], expected[2].T, rtol=1e-5)
+    assert units[1:] == ["angstrom"] * 3
+
+
 def dx(values: np.ndarray, data: bytes, kind: str) -> bytes:
     """An OpenDX file of an array (x, y, z)."""
     x, y, z = values.shape
