@@ -438,3 +438,23 @@ def test_the_source_is_counted_as_it_lies_on_disk(tmp_path: Path) -> None:
     assert bytes_on_disk([folder.parent, tmp_path / "b.raw"]) == 10
     assert bytes_on_disk([]) is None
     assert bytes_on_disk([tmp_path / "gone"]) is None
+
+
+@pytest.mark.parametrize("feature", ["all", "interval:0.2:9"])
+def test_a_variable_that_is_another_bit_by_bit_is_stored_once(tmp_path, feature: str) -> None:
+    one = np.random.default_rng(0).normal(size=(3, 4, 10, 12)).astype("f4")
+    config = EncodeConfig(max_error=0.05, features=(feature,))
+    sources = {"a": one, "b": one.copy(), "c": one + 1}
+    two, three = tmp_path / "two.fhz", tmp_path / "three.fhz"
+    less = fhash_codec.encode_dataset({"a": one, "c": one + 1}, two, config)
+    report = fhash_codec.encode_dataset(sources, three, config)
+    assert report["bytes"] < less["bytes"] + 200
+    assert sum(report["split"].values()) == report["bytes"]
+    assert report["variables"]["a"]["bytes"] == report["variables"]["b"]["bytes"]
+    with fhash_codec.open(three) as dataset:
+        assert list(dataset) == ["a", "b", "c"]
+        values = {name: np.asarray(volume) for name, volume in dataset.items()}
+        dataset.container.verify()
+    np.testing.assert_array_equal(values["a"], values["b"])
+    inside = ~np.isnan(values["c"])
+    assert np.abs(values["c"] - sources["c"])[inside].max() <= 0.05

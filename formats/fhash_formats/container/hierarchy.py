@@ -47,7 +47,8 @@ class VariablePlaces:
         name: in the file.
         header: of the variable, with the keys of the root but `variables`, checked.
         places: path in the hierarchy by name of the array.
-        own: names of the arrays that no other variable has.
+        own: names of the arrays that count as its own: all but coordinates, and arrays beside the
+            data that lie with another variable.
     """
 
     name: str
@@ -139,7 +140,12 @@ def read_variables(
                 places[name][f"{COORDINATES}{axis}"] = dimension
                 shared.add(dimension)
     found = [
-        VariablePlaces(name=name, header=header, places=places[name], own=own[name])
+        VariablePlaces(
+            name=name,
+            header=header,
+            places=places[name],
+            own=(*own[name], *(s for s in header.get(SHARES, ()) if not s.startswith(AUXILIARY))),
+        )
         for name, header in headers.items()
     ]
     return found, [array for array in others if array not in shared]
@@ -212,9 +218,10 @@ def _check_shares(header: Record, count: int) -> None:
     header.record(SHARES)
     for part, place in header.get(SHARES).items():
         number, other = place if isinstance(place, list) and len(place) == 2 else (place, part)
-        names = isinstance(other, str) and other.startswith(AUXILIARY)
-        fits = part.startswith(AUXILIARY) and names and type(number) is int and 0 <= number < count
-        header.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the number of a variable")
+        beside = part.startswith(AUXILIARY) and str(other).startswith(AUXILIARY)
+        named = part == other and not part.startswith(COORDINATES)
+        fits = (beside or named) and type(number) is int and 0 <= number < count
+        header.need(fits, SHARES, "names of arrays with the number of a variable")
 
 
 def _add_path(places: dict[str, str], name: str, array: str) -> None:

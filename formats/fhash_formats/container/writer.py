@@ -195,6 +195,8 @@ class _Variable:
         boxes: names by axis of those axes of the table that have not every position.
         shares: number of a variable, and the array's name there if it has another, by name of an
             array that lies there.
+        mark: of the file before its first array; None for the only variable.
+        written: paths of its arrays by name.
     """
 
     name: str | None
@@ -207,6 +209,8 @@ class _Variable:
     lengths: dict[str, int] = field(default_factory=dict)
     boxes: dict[str, str] = field(default_factory=dict)
     shares: dict[str, Any] = field(default_factory=dict)
+    mark: Mark | None = None
+    written: dict[str, str] = field(default_factory=dict)
 
 
 class Mark(NamedTuple):
@@ -230,8 +234,8 @@ class ContainerWriter:
     OutputError.
 
     Arrays have the names of FORMAT.md; the writer finds their paths. Several variables are written
-    one after the other, from `begin` to `finish`. Coordinates and arrays beside the data that
-    several of them have are there once.
+    one after the other, from `begin` to `finish`. Coordinates, arrays beside the data and whole
+    tables that several of them have are there once.
 
     Attributes:
         path: name that the file takes.
@@ -270,6 +274,7 @@ class ContainerWriter:
         self._names_taken = set(self._nodes.values())
         self._coordinates: dict[str, tuple[Any, ...]] = {}
         self._auxiliary: dict[tuple[Any, ...], tuple[int, str]] = {}
+        self._written: list[dict[str, str]] = []
 
     def begin(self, variable: Mapping[str, Any]) -> None:
         """Begin a variable, whose table has a name as near as possible to that of the variable.
@@ -289,6 +294,7 @@ class ContainerWriter:
                 node=self._nodes[name],
                 attributes=shown,
                 begun=begun,
+                mark=self.mark(),
             )
             return
         node = free_node(variable["name"], ())
@@ -460,6 +466,7 @@ class ContainerWriter:
         path = self._path(name)
         self._check_name(path)
         self._arrays[path] = metadata.to_dict()
+        self._current().written[name] = path
         member, data = document_member(f"{path}/{DOCUMENT}", self._position, document)
         self._write(member, [data])
         return metadata
@@ -547,9 +554,49 @@ class ContainerWriter:
         return list(container.variables.values())[-1].closing_file()
 
     def finish(self, header: Mapping[str, Any]) -> None:
-        """Take the header of a variable, which is then complete."""
+        """Take the header of a variable, which is then complete.
+
+        If an earlier variable has all of its arrays bit by bit, they are there once.
+        """
+        variable, mark = self._current(), self._current().mark
+        own = {name: path for name, path in variable.written.items() if path in self._arrays}
+        for number, others in enumerate(self._written) if mark is not None else ():
+            same = (self._same(own[name], path) for name, path in others.items())
+            if mark is not None and own and own.keys() == others.keys() and all(same):
+                self.rewind(mark)
+                variable.shares |= dict.fromkeys(own, number)
+                own = {}
+                break
+        beside = (COORDINATES, AUXILIARY)
+        self._written.append({n: path for n, path in own.items() if not n.startswith(beside)})
         self._headers.append(self._entry(header))
         self._variable = None
+
+    def _same(self, one: str, other: str) -> bool:
+        """Whether two arrays have the same numbers, coded in the same way; they are read back."""
+        described = [self._arrays[path] for path in (one, other)]
+        keys = ("shape", "data_type", "chunk_grid", "codecs", "fill_value")
+        if any(described[0][key] != described[1][key] for key in keys):
+            return False
+        listed = [
+            {
+                each.name.removeprefix(f"{path}/"): each
+                for each in self._members
+                if each.name.startswith(f"{path}/") and not each.name.endswith(f"/{DOCUMENT}")
+            }
+            for path in (one, other)
+        ]
+        if listed[0].keys() != listed[1].keys():
+            return False
+        self._file.flush()
+        with self._temporary.open("rb") as file:
+
+            def data(member: Member) -> bytes:
+                file.seek(member.end - member.size)
+                return file.read(member.size)
+
+            pairs = ((each, listed[1][key]) for key, each in listed[0].items())
+            return all(a.size == b.size and data(a) == data(b) for a, b in pairs)
 
     def commit(self, header: Mapping[str, Any] | None = None) -> int:
         """Write the groups, the root with the headers and the directory; give the file its name.

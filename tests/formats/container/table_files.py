@@ -42,10 +42,10 @@ PLAIN = TileSettings(
 MASK = MaskLevels(edges=(0.0,), scores=(0, 300))
 
 
-def table_parts(*, head: bool = True, mask: bool = True) -> TableParts:
+def table_parts(*, head: bool = True, mask: bool = True, seed: int = 1) -> TableParts:
     """A table of two tiles; the first one's vertices are occupied where values are above 0."""
     settings = replace(PLAIN, head=HEAD if head else None, mask=MASK if mask else None)
-    values = np.random.default_rng(1).normal(0.5, 0.8, (*SHAPE[:3], 8)).clip(-2, 3).astype("f4")
+    values = np.random.default_rng(seed).normal(0.5, 0.8, (*SHAPE[:3], 8)).clip(-2, 3).astype("f4")
     tiles = [values[..., :4], values[..., 4:]]
     occupied = [tiles[0] > 0, np.ones(TILE, bool)]
     streams = [

@@ -278,7 +278,7 @@ ROOTS = {
         "variable 'u': .*levels",
     ),
     "shares that are a list": (f"{FIRST}.shares", ["auxiliary/lat"], "an object"),
-    "a shared table": (f"{FIRST}.shares", {"tables/level_1": 2}, "auxiliary/..."),
+    "a shared table": (f"{FIRST}.shares", {"tables/level_1": 2}, "which u is already"),
     "shares of no variable": (f"{FIRST}.shares", {"auxiliary/a": 3}, "number of a variable"),
     "shares of no number": (f"{FIRST}.shares", {"auxiliary/a": "w"}, "number of a variable"),
     "shares that are not there": (
