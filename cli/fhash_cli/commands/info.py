@@ -175,8 +175,8 @@ def listing(path: str, files: int, found: Sequence[Listed], *, named: bool = Fal
             rest = [entry.name for entry in good[MAX_ROWS:]]
             lines.append(f"and {len(rest)} more: {listed(rest)}; --json lists all")
         lines += ["", *_commands(path, good)]
-    lines += ["" for problem in found[len(good) :][:1]]
-    lines += _refused([entry for entry in found if not entry.options])
+    if refused := _refused([entry for entry in found if not entry.options]):
+        lines += ["", *refused]
     return "\n".join(map(one_line, lines))
 
 

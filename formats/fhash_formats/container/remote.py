@@ -11,7 +11,6 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
-from importlib import import_module
 from itertools import count
 from typing import Any, TypeVar
 
@@ -24,7 +23,7 @@ from fhash_formats.errors import (
     MissingDependencyError,
     MissingInputError,
 )
-from fhash_formats.support.files import by_obstore
+from fhash_formats.support.files import object_store
 
 TAIL_BYTES = 16 << 10
 """Bytes of the end of a file that are read first; directory and header of most files lie there."""
@@ -243,19 +242,9 @@ _PASSING = {408, 425, 429, 500, 502, 503, 504}
 _CHANGED = 412
 """HTTP status that says that the file is not the one that was asked for."""
 _STAMP = (
-    *(
-        "size",
-        "ETag",
-        "etag",
-        "e_tag",
-        "Content-MD5",
-        "Digest",
-        "md5Hash",
-        "content_md5",
-        "checksum",
-    ),
+    *("size", "ETag", "etag", "Content-MD5", "Digest", "md5Hash", "content_md5", "checksum"),
     *("Last-Modified", "LastModified", "last_modified", "mtime", "modified", "updated"),
-    *("generation", "VersionId", "version_id", "created", "ino"),
+    *("generation", "VersionId", "version_id", "created", "ino", "e_tag"),
 )
 """Entries of `fs.info` that differ between a file and another one in its place."""
 
@@ -318,9 +307,9 @@ class FsspecFile:
                 f"{url}: URLs need fsspec; pip install 'fhash[remote]'"
             ) from error
         try:
-            if not options and by_obstore(url):
-                fs = import_module("obstore.fsspec").FsspecStore(url.partition("://")[0])
-                return cls(fs, url, url)
+            store = None if options else object_store(url)
+            if store is not None:
+                return cls(store, url, url)
             fs, path = url_to_fs(url, **options)
         except ImportError as error:
             needed = "pip install 'fhash[remote]'" if url.startswith("http") else _first_line(error)

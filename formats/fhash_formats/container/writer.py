@@ -213,6 +213,10 @@ class _Variable:
     written: dict[str, str] = field(default_factory=dict)
 
 
+CODED = ("shape", "data_type", "chunk_grid", "codecs", "fill_value")
+"""Keys of an array's document that say how its numbers are coded."""
+
+
 class Mark(NamedTuple):
     """A state of a `ContainerWriter`: its position, and the number of members and the arrays."""
 
@@ -274,7 +278,7 @@ class ContainerWriter:
         self._names_taken = set(self._nodes.values())
         self._coordinates: dict[str, tuple[Any, ...]] = {}
         self._auxiliary: dict[tuple[Any, ...], tuple[int, str]] = {}
-        self._written: list[dict[str, str]] = []
+        self._finished: dict[bytes, tuple[int, dict[tuple[str, str], Member]]] = {}
 
     def begin(self, variable: Mapping[str, Any]) -> None:
         """Begin a variable, whose table has a name as near as possible to that of the variable.
@@ -558,36 +562,31 @@ class ContainerWriter:
 
         If an earlier variable has all of its arrays bit by bit, they are there once.
         """
-        variable, mark = self._current(), self._current().mark
-        own = {name: path for name, path in variable.written.items() if path in self._arrays}
-        for number, others in enumerate(self._written) if mark is not None else ():
-            same = (self._same(own[name], path) for name, path in others.items())
-            if mark is not None and own and own.keys() == others.keys() and all(same):
-                self.rewind(mark)
-                variable.shares |= dict.fromkeys(own, number)
-                own = {}
-                break
-        beside = (COORDINATES, AUXILIARY)
-        self._written.append({n: path for n, path in own.items() if not n.startswith(beside)})
+        variable = self._current()
+        if variable.mark is not None:
+            self._share(variable, variable.mark)
         self._headers.append(self._entry(header))
         self._variable = None
 
-    def _same(self, one: str, other: str) -> bool:
-        """Whether two arrays have the same numbers, coded in the same way; they are read back."""
-        described = [self._arrays[path] for path in (one, other)]
-        keys = ("shape", "data_type", "chunk_grid", "codecs", "fill_value")
-        if any(described[0][key] != described[1][key] for key in keys):
-            return False
-        listed = [
-            {
-                each.name.removeprefix(f"{path}/"): each
-                for each in self._members
-                if each.name.startswith(f"{path}/") and not each.name.endswith(f"/{DOCUMENT}")
-            }
-            for path in (one, other)
-        ]
-        if listed[0].keys() != listed[1].keys():
-            return False
+    def _share(self, variable: _Variable, mark: Mark) -> None:
+        """Drop the arrays of a variable if an earlier one has all of them, coded in the same way.
+
+        Sizes and checksums find the earlier one, and the bytes are read back to be compared.
+        """
+        names = {path: name for name, path in variable.written.items() if path in self._arrays}
+        tables = {p: n for p, n in names.items() if not n.startswith((COORDINATES, AUXILIARY))}
+        contents = {
+            (name, member.name.removeprefix(path)): member
+            for path, name in tables.items()
+            for member in self._members[mark.members :]
+            if member.name.startswith(f"{path}/") and not member.name.endswith(f"/{DOCUMENT}")
+        }
+        coded = [[name, *map(self._arrays[path].get, CODED)] for path, name in tables.items()]
+        sizes = [(place, member.size, member.crc) for place, member in contents.items()]
+        look = sha256(repr((coded, sizes)).encode()).digest()
+        number, others = self._finished.setdefault(look, (variable.number, contents))
+        if number == variable.number or len(tables) < len(names):
+            return
         self._file.flush()
         with self._temporary.open("rb") as file:
 
@@ -595,8 +594,10 @@ class ContainerWriter:
                 file.seek(member.end - member.size)
                 return file.read(member.size)
 
-            pairs = ((each, listed[1][key]) for key, each in listed[0].items())
-            return all(a.size == b.size and data(a) == data(b) for a, b in pairs)
+            if any(data(member) != data(others[place]) for place, member in contents.items()):
+                return
+        self.rewind(mark)
+        variable.shares |= dict.fromkeys(tables.values(), number)
 
     def commit(self, header: Mapping[str, Any] | None = None) -> int:
         """Write the groups, the root with the headers and the directory; give the file its name.

@@ -47,7 +47,7 @@ from fhash_formats.series import (
     warn_not_stored,
 )
 from fhash_formats.support.dates import clock
-from fhash_formats.support.files import by_obstore, file_name, is_url, without_secrets
+from fhash_formats.support.files import file_name, is_url, object_store, without_secrets
 from fhash_formats.support.values import PACKING
 
 if TYPE_CHECKING:
@@ -378,19 +378,18 @@ def open_url(url: str, request: Request) -> Source:
     place, shown = url.split("?")[0].rstrip("/"), without_secrets(url)
     suffix = Path(file_name(url)).suffix.lower()
     fsspec = library(url, "a URL", "fsspec", "fhash[remote]")
-    direct = by_obstore(url)
+    files = object_store(url)
     with refusing(f"{shown} cannot be read"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a store without consolidated metadata
         if suffix == ".zarr":
             stored: Any = url
-            if direct:
+            if files is not None:
                 store = import_module("obstore.store").from_url(place)
                 stored = import_module("zarr.storage").ObjectStore(store, read_only=True)
             dataset = xr.open_dataset(stored, engine="zarr", **wishes)
         else:
             # blocks, since HDF5 reads few bytes here and there
-            if direct:
-                files = import_module("obstore.fsspec").FsspecStore(url.partition("://")[0])
+            if files is not None:
                 stored = files.open(place, buffer_size=BLOCK)
             else:
                 files, inside = fsspec.core.url_to_fs(url)

@@ -262,7 +262,7 @@ def test_a_package_that_is_missing(monkeypatch, missing: str, url: str, told: st
     for scheme in ("http", "https", "s3"):
         monkeypatch.delitem(known, scheme, raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
-    monkeypatch.setattr(fsspec_file, "by_obstore", lambda url: False)
+    monkeypatch.setattr(fsspec_file, "object_store", lambda url: None)
     with pytest.raises(MissingDependencyError, match=told):
         FsspecFile.open(url, {})
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from range_server import RangeServer
 from stored_series import frames
 
 from fhash_formats.container.zip_file import ending
@@ -772,71 +770,3 @@ def test_numbers_that_names_leave_out_are_told(tmp_path: Path, names: list[str],
         with open_series(tmp_path / "*.npy") as series:
             assert series.shape[0] == len(names)
     assert [told in str(each.message) for each in caught] == ([True] if told else [])
-
-
-@pytest.fixture
-def elsewhere(tmp_path: Path) -> Iterator[tuple[xr.Dataset, str, RangeServer]]:
-    """A dataset, the URL of a folder with it as a.nc and a.zarr, and their server."""
-    packed = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype("f4")
-    packed[1, 2] = np.nan
-    made = xr.Dataset(
-        {"u": (("time", "lev", "lat", "lon"), packed, {"units": "m/s"}), "w": ("lev", [1.0, 2, 3])},
-        coords={
-            "time": ("time", [0.5, 1, 2, 4], {"units": "days since 2001-01-01"}),
-            "lat": ("lat", np.arange(5.0), {"units": "degrees_north"}),
-        },
-        attrs={"title": "elsewhere"},
-    )
-    encoding = {"u": {"dtype": "i2", "scale_factor": 1e-3, "_FillValue": np.int16(-32768)}}
-    made.to_netcdf(tmp_path / "a.nc", engine="h5netcdf", encoding=encoding)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of consolidated metadata, which are no part of Zarr 3
-        made.to_zarr(tmp_path / "a.zarr", encoding=encoding, consolidated=True)
-    with RangeServer() as server:
-        url = server.put("bucket/a.nc", (tmp_path / "a.nc").read_bytes())
-        for file in (tmp_path / "a.zarr").rglob("*"):
-            if file.is_file():
-                server.put(f"bucket/{file.relative_to(tmp_path).as_posix()}", file.read_bytes())
-        yield made, url.removesuffix("/a.nc"), server
-
-
-@pytest.mark.parametrize("name", ["a.nc", "a.zarr"])
-@pytest.mark.parametrize("way", ["http", "s3"])
-def test_data_at_a_url_are_those_of_the_file(
-    elsewhere: tuple[xr.Dataset, str, RangeServer],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    name: str,
-    way: str,
-) -> None:
-    _, folder, _ = elsewhere
-    if way == "s3":
-        stores = pytest.importorskip("obstore.fsspec")
-        stores.FsspecStore.clear_instance_cache()  # of other servers
-        monkeypatch.setenv("AWS_ENDPOINT", folder.removesuffix("/bucket"))
-        for key, value in (("SKIP_SIGNATURE", "true"), ("ALLOW_HTTP", "true"), ("REGION", "x")):
-            monkeypatch.setenv(f"AWS_{key}", value)
-        folder = "s3://bucket"
-    with open_series(f"{folder}/{name}") as there, open_series(tmp_path / name) as here:
-        for one, other in zip(there.frames(), here.frames(), strict=True):
-            np.testing.assert_array_equal(one, other)
-        assert there.name == here.name == "u"
-        assert there.dtype == here.dtype
-        assert there.coords["t"].values.tolist() == [0.5, 1, 2, 4]
-        assert there.coords["t"].attributes == here.coords["t"].attributes
-        assert there.metadata.attributes == here.metadata.attributes
-        assert {each.name for each in there.metadata.variables} == {
-            each.name for each in here.metadata.variables
-        }
-    ours, theirs = list_variables(f"{folder}/{name}"), list_variables(tmp_path / name)
-    assert {each.name: each for each in ours} == {each.name: each for each in theirs}
-
-
-def test_a_url_without_data(elsewhere: tuple[xr.Dataset, str, RangeServer]) -> None:
-    _, folder, server = elsewhere
-    server.put("bucket/b.nc", b"nothing of the kind")
-    with pytest.raises(InputError, match=r"run\.fhz: data at a URL are"):
-        open_series(f"{folder}/run.fhz")
-    for name in ("b.nc", "c.nc", "c.zarr"):
-        with pytest.raises(InputError, match=f"{name} cannot be read"):
-            open_series(f"{folder}/{name}")
