@@ -1,0 +1,33 @@
+// What calls share (fhash_context in fhash.h).
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <vector>
+
+#include "status.hpp"
+
+namespace fhash {
+struct Settings;  // settings.hpp
+}
+
+struct fhash_context {
+    uint64_t memory;  // bytes that a call may use beside the caller's arrays; 0 for no limit
+    int32_t threads;
+    std::mutex lock;
+    // Unpacked settings by their bytes, those used last in front.
+    std::vector<std::pair<std::string, std::shared_ptr<const fhash::Settings>>> settings;
+};
+
+namespace fhash {
+
+// Whether a call may use so many bytes; fails otherwise.
+inline bool may_use(const fhash_context& context, uint64_t bytes, fhash_error& error) {
+    if (context.memory == 0 || bytes <= context.memory) return true;
+    return fail(error, FHASH_ERROR_MEMORY, "%llu bytes are needed, and %llu are allowed",
+                (unsigned long long)bytes, (unsigned long long)context.memory);
+}
+
+}  // namespace fhash
