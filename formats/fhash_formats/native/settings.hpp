@@ -88,8 +88,8 @@ std::shared_ptr<const Settings> unpack_settings(fhash_context& context, const ui
 
 // Bytes that are read from their start on.
 struct Bytes {
-    const uint8_t* at;
-    const uint8_t* end;
+    const uint8_t* at = nullptr;
+    const uint8_t* end = nullptr;
 
     size_t left() const { return (size_t)(end - at); }
     bool take(size_t count, const uint8_t*& taken) {
