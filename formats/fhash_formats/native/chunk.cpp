@@ -556,26 +556,29 @@ int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const 
     });
 }
 
-// Code a tile with the settings of `tile`.
+// Code a tile with the settings of `tile`; without any it is stored without loss.
 //
-// in_coreset: the values that count; null for all. decoded: room for the decoded values, or null.
+// in_coreset: the values that count, or without settings the mask of the stream; null for all. decoded: room for the decoded values, or null.
 // data, size: get the stream, which fhash_tile_free releases. nonzero: coded integers other than 0.
 FHASH_EXPORT int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile,
                                      const void* values, const uint8_t* in_coreset,
                                      const fhash_coding* coding, void* decoded, uint8_t** data,
                                      size_t* size, int64_t* nonzero, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
-        const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
-                                              tile->settings_size, failed);
-        if (!settings) return false;
         if (!is_shape(tile->shape))
             return fail(failed, FHASH_ERROR_ARGUMENT, "a tile has four lengths");
         Shape shape;
         std::copy_n(tile->shape, 4, shape.begin());
         Coded coded;
-        if (!encode_tile(*context, settings, shape, tile->type, values, in_coreset, *coding, coded,
-                         failed))
+        if (tile->settings) {
+            const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
+                                                  tile->settings_size, failed);
+            if (!settings || !encode_tile(*context, settings, shape, tile->type, values,
+                                          in_coreset, *coding, coded, failed))
+                return false;
+        } else if (!encode_exact(nullptr, shape, tile->type, values, in_coreset, coded, failed)) {
             return false;
+        }
         *data = (uint8_t*)std::malloc(coded.data.size());
         if (!*data) return fail(failed, FHASH_ERROR_MEMORY, "no memory for a stream");
         std::memcpy(*data, coded.data.data(), coded.data.size());
