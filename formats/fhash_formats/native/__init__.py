@@ -5,8 +5,7 @@ when the package is installed, and without it nothing works. tests/reference dec
 in numpy.
 
 `PROTOTYPES` lists the exported functions that this package calls, with the types of their
-arguments. Every exported function returns an int64: at least 0 for success, below 0 for an error
-(core.hpp).
+arguments. Every kernel returns an int64: at least 0 for success, below 0 for an error (core.hpp).
 """
 
 from __future__ import annotations
@@ -67,7 +66,30 @@ _MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
 _TYPES = ("f32", "f64")
 _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
+_TILE = (ARRAY, ARRAY)
+"""Context and tile."""
+_STREAM = (*_TILE, ARRAY, ctypes.c_size_t)
+
+_TILES: Prototypes = {
+    "fhash_context_create": (ctypes.c_uint64, ctypes.c_int32),
+    "fhash_tile_decode": (*_STREAM, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
+    "fhash_tile_table": (*_STREAM, ctypes.c_int32, *(ARRAY,) * 4),
+    "fhash_tile_uncorrected": (*_STREAM, *(ARRAY,) * 4),
+    "fhash_tile_part": (*_TILE, *(ARRAY,) * 4),
+    "fhash_tile_fill": (*_TILE, ARRAY, ARRAY, ctypes.c_int32, ARRAY, ARRAY),
+    "fhash_tile_forward": (*_TILE, *(ARRAY,) * 3),
+    "fhash_tile_foretell": (*_TILE, ARRAY, REAL, REAL, ARRAY, ARRAY),
+    "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
+    "fhash_tile_free": (ARRAY,),
+    "fhash_tile_bound": (ARRAY,),
+    "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),
+}
+"""Functions of fhash.h, chunk.cpp and part.cpp, whose result is an int32."""
+_RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.c_size_t}
+"""Other results."""
+
 PROTOTYPES: Prototypes = {
+    **_TILES,
     # coder.cpp
     "fhash_encode": (
         ARRAY,
@@ -204,4 +226,4 @@ def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: 
 def _declare(loaded: ctypes.CDLL, name: str, arguments: tuple[Any, ...]) -> None:
     function = getattr(loaded, name)
     function.argtypes = arguments
-    function.restype = ctypes.c_int64
+    function.restype = _RESULTS.get(name, ctypes.c_int32 if name in _TILES else ctypes.c_int64)
