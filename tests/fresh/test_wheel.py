@@ -15,7 +15,7 @@ import pytest
 from fresh_install import fhash, run
 
 LIBRARIES = (
-    "fhash_formats/native/_core.so",
+    "fhash_formats/native/libfhash.so",
     "fhash_codec/native/_codec.so",
     "fhash_codec/native/network/_network.so",
 )

@@ -139,7 +139,7 @@ _LOADED: dict[tuple[Path, str, int], ctypes.CDLL] = {}
 
 def library() -> ctypes.CDLL:
     """The native library of this package; see `load_library`."""
-    return load_library(_FOLDER, "_core", ABI_VERSION, PROTOTYPES)
+    return load_library(_FOLDER, "libfhash", ABI_VERSION, PROTOTYPES)
 
 
 def crc32c(data: bytes | memoryview) -> int:
