@@ -128,7 +128,8 @@ def native(
 ) -> Extension:
     """The library of all C++ sources in a folder.
 
-    `flags` and `link_flags` are added to those of every library, where the compiler is GCC or Clang.
+    `flags` and `link_flags` are added to those of every library, where the compiler is GCC or
+    Clang.
     """
     headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp")}
     return Extension(

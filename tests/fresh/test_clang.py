@@ -31,7 +31,7 @@ RUN = """
 import os, pathlib, pytest, sys
 import numpy as np
 import fhash_codec, fhash_formats.native as native
-native._FOLDER = pathlib.Path(sys.argv[1])
+native.FOLDER = pathlib.Path(sys.argv[1])
 code = 0
 for tests, long, names in (
     ("golden/test_golden.py", "1", "their_values or same_bits"),

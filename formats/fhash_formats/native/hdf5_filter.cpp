@@ -15,10 +15,10 @@
 //     7-10   vertices of a chunk along t, z, y, x; of more axes, t has the leading ones
 //     11     1 where the dataset has a fill value, else 0
 //     12, 13 bits of the fill value, the lower 32 first
-#include <climits>
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
+#include <utility>
 
 #include "core.hpp"
 #include "status.hpp"
@@ -139,8 +139,9 @@ bool read_quality(const unsigned* numbers, size_t count, fhash_quality& quality,
 
 // The fhash_type of a type of HDF5; 0 for one that is not coded.
 int32_t known_type(const Hdf5& hdf5, Id type) {
-    const size_t size = hdf5.call<size_t>("H5Tget_size", 0, type);
     const int cls = hdf5.call("H5Tget_class", -1, type);
+    if (cls != 0 && cls != 1) return 0;  // neither integers nor floats
+    const size_t size = hdf5.call<size_t>("H5Tget_size", 0, type);
     const int order = hdf5.call("H5Tget_order", -1, type);
     int32_t log = 0;
     while ((size_t)1 << log < size && log < 4) log++;
@@ -150,7 +151,7 @@ int32_t known_type(const Hdf5& hdf5, Id type) {
         const int sign = hdf5.call("H5Tget_sign", -1, type);
         return sign < 0 ? 0 : (sign == 1 ? FHASH_INT8 : FHASH_UINT8) + log;
     }
-    if (cls != 1 || log == 0) return 0;
+    if (log == 0) return 0;
     const size_t exponents[] = {5, 8, 11}, exponent = exponents[log - 1];
     const size_t mantissa = 8 * size - 1 - exponent;
     size_t found[5] = {0, 0, 0, 0, 0};  // place of the sign; place and bits of exponent, mantissa
@@ -261,17 +262,11 @@ bool read_chunk(const unsigned* numbers, size_t count, Chunk& chunk, fhash_error
 
 // Memory that HDF5 may free.
 struct Buffer {
-    explicit Buffer(size_t bytes) : data((uint8_t*)std::malloc(bytes ? bytes : 1)) {}
+    explicit Buffer(size_t bytes) : data(std::malloc(bytes ? bytes : 1)) {}
     ~Buffer() { std::free(data); }
     Buffer(const Buffer&) = delete;
     Buffer& operator=(const Buffer&) = delete;
-
-    // Takes the place of HDF5's.
-    void swap(size_t room, size_t* size, void** given) {
-        std::swap(*(void**)&data, *given);
-        *size = room;
-    }
-    uint8_t* data;
+    void* data;
 };
 
 struct Context {
@@ -291,9 +286,9 @@ size_t decode(const Chunk& chunk, size_t given, size_t* size, void** buffer, fha
                           &error)) {
         return 0;
     }
-    if (chunk.swapped) swap_bytes(values.data, chunk.bytes, chunk.each);
-    values.swap(chunk.bytes, size, buffer);
-    return chunk.bytes;
+    if (chunk.swapped) swap_bytes((uint8_t*)values.data, chunk.bytes, chunk.each);
+    std::swap(values.data, *buffer);
+    return *size = chunk.bytes;
 }
 
 // Encodes a chunk in place; the bytes of the stream, or 0.
@@ -314,7 +309,7 @@ size_t encode(const Chunk& chunk, const unsigned* numbers, size_t given, size_t*
     const void* values = *buffer;
     if (chunk.swapped) {
         values = std::memcpy(copy.data, *buffer, given);
-        swap_bytes(copy.data, given, chunk.each);
+        swap_bytes((uint8_t*)copy.data, given, chunk.each);
     }
     const uint64_t bits = (uint64_t)numbers[13] << 32 | numbers[12];
     uint8_t fill[8];
@@ -326,7 +321,8 @@ size_t encode(const Chunk& chunk, const unsigned* numbers, size_t given, size_t*
                           stream.data, room, &coded, &error)) {
         return 0;
     }
-    stream.swap(room, size, buffer);
+    std::swap(stream.data, *buffer);
+    *size = room;
     return coded;
 }
 
