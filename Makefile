@@ -45,6 +45,10 @@ lib:
 	cmake --build build/cmake --parallel 2
 	cmake --install build/cmake
 
+# What pvpython shows of a container, and its picture in build/paraview. Needs paraview, python3-paraview and xvfb.
+paraview: .venv/.stamp
+	FHASH_PARAVIEW=$(CURDIR)/build/paraview $(BIN)/python -m pytest -rs tests/codec/views/test_vtk.py
+
 # Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/gpu.md): 7 minutes.
 device:
 	$(PYTHON) setup.py -q build_ext --inplace

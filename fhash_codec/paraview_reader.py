@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -153,18 +154,20 @@ class File:
     """
 
     def __init__(self, path: str) -> None:
-        self._file = ctypes.c_void_p()
-        self._library = _library()
-        self._context = self._library.fhash_context_create(0, os.cpu_count() or 1)
-        self._call("fhash_open_path", self._context, path.encode(), ctypes.byref(self._file))
+        self._library = library = _library()
+        self._file = file = ctypes.c_void_p()
+        context = ctypes.c_void_p(library.fhash_context_create(0, os.cpu_count() or 1))
+
+        def close() -> None:
+            if file:
+                library.fhash_close(file)
+            library.fhash_context_destroy(context)
+
+        weakref.finalize(self, close)
+        self._call("fhash_open_path", context, os.fsencode(path), ctypes.byref(file))
         self.variables = [
             self._variable(number) for number in range(self._library.fhash_variables(self._file))
         ]
-
-    def __del__(self) -> None:
-        if self._file:
-            self._library.fhash_close(self._file)
-        self._library.fhash_context_destroy(self._context)
 
     def _call(self, name: str, *arguments: Any) -> None:
         error = _Error()
