@@ -35,7 +35,7 @@ COMMANDS = {
     "serve": "give decoded values of RUN.fhz over HTTP, as Zarr, to any client",
     "export": "write the model of RUN.fhz in plain numbers, for any Zarr library",
     "hdf5-plugin-path": "print the folder of the filter for HDF5, for HDF5_PLUGIN_PATH",
-    "paraview": "print the path of ParaView's reader, or start ParaView with it",
+    "paraview": "open RUN.fhz in ParaView, or print the path of its reader",
     "verify": "read and check every part of RUN.fhz",
     "diff": "measure RUN.fhz against the data it was made from",
     "demo": "simulate, encode, decode, compare, draw",
@@ -80,7 +80,7 @@ class Program(click.Group):
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands for `--help`, without importing them."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl(list(COMMANDS.items()), col_max=10)  # one name is longer
 
     def invoke(self, context: click.Context) -> Any:
         """Run the command; each warning is one line on stderr.

@@ -20,7 +20,8 @@ int main(int count, char** words) {
     if (count != 2) return 2;
     memcpy(numbers + 1, &bound, sizeof bound);
     for (int i = 0; i < T * Y * X; i++) values[i] = (float)(i % X * (i / X % Y)) / 64 + i / (X * Y);
-    if (check(nc_create(words[1], NC_NETCDF4, &file)) || check(nc_def_dim(file, "t", T, dimensions)) ||
+    if (check(nc_create(words[1], NC_NETCDF4, &file)) ||
+        check(nc_def_dim(file, "t", T, dimensions)) ||
         check(nc_def_dim(file, "y", Y, dimensions + 1)) ||
         check(nc_def_dim(file, "x", X, dimensions + 2)) ||
         check(nc_def_var(file, "v", NC_FLOAT, 3, dimensions, &variable)) ||

@@ -44,19 +44,16 @@ def hdf5_plugin_path_command() -> None:
 
 @click.command("paraview", cls=BaseCommand)
 @click.argument("files", metavar="[FILE]...", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--start", is_flag=True, help="Start ParaView with the reader, and open FILEs.")
-def paraview_command(files: tuple[Path, ...], start: bool) -> None:
-    """Print the path of ParaView's reader of .fhz files, or start ParaView with it.
+def paraview_command(files: tuple[Path, ...]) -> None:
+    """Start ParaView with its reader of .fhz files and with FILEs; or print the reader's path.
 
-    Load the path by Tools > Manage Plugins > Load New, or in pvpython by LoadPlugin. A copy of the
+    Without FILEs nothing is started. Load the path by Tools > Manage Plugins > Load New, or in pvpython by LoadPlugin. A copy of the
     file elsewhere needs the variable FHASH_LIBRARY, which is printed, too.
     """
     from fhash_codec import paraview_reader
 
     plugin = Path(paraview_reader.__file__)
-    if not start:
-        if files:
-            raise click.UsageError("files are opened with --start")
+    if not files:
         _print(plugin, f"FHASH_LIBRARY={FOLDER / 'libfhash.so'}")
         return
     program = shutil.which("paraview")

@@ -192,8 +192,8 @@ bool complete(const Hdf5& hdf5, Id properties, Id type, unsigned* numbers, unsig
         values *= chunk[axis];  // HDF5 allows chunks below 4 GiB
     }
     if (values > (uint64_t)MOST_VALUES) {
-        return fail(error, FHASH_ERROR_UNSUPPORTED, "a chunk has %llu values; at most 2^27 are coded",
-                    (unsigned long long)values);
+        return fail(error, FHASH_ERROR_UNSUPPORTED,
+                    "a chunk has %llu values; at most 2^27 are coded", (unsigned long long)values);
     }
     const bool big = hdf5.call("H5Tget_order", 0, type) == 1;
     numbers[5] = (unsigned)known;
