@@ -101,9 +101,9 @@ def test_paraview_plays_a_file_and_shows_its_bits(run: Path, tmp_path: Path) -> 
 
 def test_paraview_says_what_is_damaged(run: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.fhz").write_bytes(run.read_bytes()[:1000])
-    with pytest.raises(OSError, match=r"cut\.fhz"):
+    with pytest.raises(OSError, match="cut short"):
         paraview_reader.File(str(tmp_path / "cut.fhz"))
-    with pytest.raises(OSError, match="nothing"):
+    with pytest.raises(OSError, match="cannot be opened"):
         paraview_reader.File(str(tmp_path / "nothing.fhz"))
 
 
