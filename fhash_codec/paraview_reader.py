@@ -19,6 +19,8 @@ EVEN = 1e-6
 """Share of an axis' extent that its positions may be off evenly spaced ones."""
 HIDDEN_POINT = 2
 """Ghost flag of VTK's points that are not drawn."""
+HIDDEN_CELL = 32
+"""Ghost flag of VTK's cells that are not drawn."""
 NUMBER_TYPES = (
     "int8",
     "int16",
@@ -60,7 +62,7 @@ def vtk_grid(
     """A vtkImageData where all axes are even, else a vtkRectilinearGrid.
 
     fields: name, unit and values (z, y, x) of each; those without a value are NaN, and points
-        where all are NaN are hidden.
+        where all are NaN are hidden, with the cells around them.
     positions: along z, y and x of the whole grid, ascending.
     corner: index (z, y, x) of the fields' first point in the whole grid.
     """
@@ -94,10 +96,19 @@ def vtk_grid(
             grid.GetFieldData().AddArray(told)
     points.SetActiveScalars(fields[0][0])
     hidden = np.logical_and.reduce([np.isnan(values) for _, _, values in fields])
-    if hidden.any():
-        ghosts = numpy_to_vtk(hidden.ravel().astype(np.uint8) * HIDDEN_POINT, deep=1)
+    if not hidden.any():
+        return grid
+    cells = hidden  # those with a hidden corner: surfaces are drawn of cells
+    for axis, n in enumerate(hidden.shape):
+        if n > 1:
+            cells = np.delete(cells, -1, axis) | np.delete(cells, 0, axis)
+    for data, mask, flag in (
+        (points, hidden, HIDDEN_POINT),
+        (grid.GetCellData(), cells, HIDDEN_CELL),
+    ):
+        ghosts = numpy_to_vtk(mask.ravel().astype(np.uint8) * flag, deep=1)
         ghosts.SetName("vtkGhostType")
-        points.AddArray(ghosts)
+        data.AddArray(ghosts)
     return grid
 
 

@@ -47,8 +47,9 @@ def hdf5_plugin_path_command() -> None:
 def paraview_command(files: tuple[Path, ...]) -> None:
     """Start ParaView with its reader of .fhz files and with FILEs; or print the reader's path.
 
-    Without FILEs nothing is started. Load the path by Tools > Manage Plugins > Load New, or in pvpython by LoadPlugin. A copy of the
-    file elsewhere needs the variable FHASH_LIBRARY, which is printed, too.
+    Without FILEs nothing is started. Load the path by Tools > Manage Plugins > Load New, or in
+    pvpython by LoadPlugin. A copy of the file elsewhere needs the variable FHASH_LIBRARY, which is
+    printed, too.
     """
     from fhash_codec import paraview_reader
 

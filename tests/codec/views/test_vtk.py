@@ -154,6 +154,7 @@ def test_to_vtk_has_the_values_at_their_positions(run: Path, lod: int) -> None:
     assert grid.GetPoint(0) == pytest.approx((15, 50, 2**1.5))
     assert vtk_to_numpy(grid.GetPointData().GetArray("speed")).tobytes() == expected.tobytes()
     assert grid.GetPointData().GetArray("vtkGhostType").GetRange() == (0, 2)
+    assert grid.GetCellData().GetArray("vtkGhostType").GetRange() == (0, 32)
 
 
 def test_to_vtk_of_even_axes_is_an_image(whole: Path) -> None:
