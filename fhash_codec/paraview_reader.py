@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import weakref
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,7 @@ class File:
 
         weakref.finalize(self, close)
         self._call("fhash_open_path", context, os.fsencode(path), ctypes.byref(file))
+        self._positions: dict[tuple[int, int], Any] = {}
         self.variables = [
             self._variable(number) for number in range(self._library.fhash_variables(self._file))
         ]
@@ -192,9 +194,11 @@ class File:
 
     def positions(self, number: int, axis: int) -> Any:
         """Positions (n,) of a variable along an axis, 0 to 3 for t, z, y, x."""
-        found = np.empty(self.variables[number].shape[axis])
-        self._call("fhash_coordinate", self._file, number, axis, found.ctypes.data, None)
-        return found
+        if (number, axis) not in self._positions:
+            found = np.empty(self.variables[number].shape[axis])
+            self._call("fhash_coordinate", self._file, number, axis, found.ctypes.data, None)
+            self._positions[number, axis] = found
+        return self._positions[number, axis]
 
     def read(self, number: int, step: float, region: list[int], lod: int) -> Any:
         """Values (z, y, x) of a region z0, z1, y0, y1, x0, x1, of every 2^lod-th vertex.
@@ -237,7 +241,9 @@ else:
         def __init__(self) -> None:
             super().__init__(nInputPorts=0, nOutputPorts=1, outputType="vtkDataSet")
             self._path = ""
-            self._lod = 0
+            self._lod = self._moving_lod = 0
+            self._moving = False
+            self._watched: list[Any] = []
             self._file: File | None = None
             self._arrays = vtkDataArraySelection()
             self._arrays.AddObserver("ModifiedEvent", lambda *_: self.Modified())
@@ -259,6 +265,14 @@ else:
                 self._lod = lod
                 self.Modified()
 
+        @smproperty.intvector(name="LevelWhileMoving", label="Level While Moving", default_values=0)
+        @smdomain.intrange(min=0, max=10)
+        def SetLevelWhileMoving(self, lod: int) -> None:
+            """Choose the level of detail while a view is turned, where that is coarser."""
+            if lod != self._moving_lod:
+                self._moving_lod = lod
+                self.Modified()
+
         @smproperty.dataarrayselection(name="Variables")
         def GetVariables(self) -> Any:
             """The selection of variables."""
@@ -271,6 +285,41 @@ else:
             """The times of the first variable that is chosen."""
             opened = self._opened()
             return [] if opened is None else [float(time) for time in self._times(opened)]
+
+        @property
+        def _level(self) -> int:
+            return max(self._lod, self._moving_lod) if self._moving else self._lod
+
+        def _watch(self) -> None:
+            """Observe the views of this process, which a server has not."""
+            from paraview import servermanager
+
+            if self._moving_lod <= self._lod or servermanager.ActiveConnection is None:
+                return
+            for view in servermanager.GetRenderViews():
+                interactor = view.GetInteractor()
+                if interactor is None or interactor in self._watched:
+                    continue
+                self._watched.append(interactor)
+                for event, moving in (
+                    ("StartInteractionEvent", True),
+                    ("EndInteractionEvent", False),
+                ):
+                    # before ParaView's own observer, which draws
+                    interactor.AddObserver(event, partial(self._turn, view, moving), 1.0)
+
+        def _turn(self, view: Any, moving: bool, *_: Any) -> None:
+            """Read at the level of detail of a view that is turned, or no longer is."""
+            from paraview import servermanager
+
+            if self._moving_lod <= self._lod or moving == self._moving:
+                return
+            self._moving = moving
+            self.Modified()
+            for source in servermanager.ProxyManager().GetProxiesInGroup("sources").values():
+                if source.SMProxy.GetClientSideObject() is self:
+                    source.SMProxy.MarkDirty(source.SMProxy)
+            view.SMProxy.Update()
 
         def _opened(self) -> File | None:
             """The file, which is opened on the first call; None where that fails."""
@@ -309,7 +358,7 @@ else:
 
         def _axes(self, opened: File) -> list[tuple[Any, int]]:
             """Positions along z, y and x at the level of detail, and how they were turned."""
-            first, stride = self._chosen(opened)[0], 1 << self._lod
+            first, stride = self._chosen(opened)[0], 1 << self._level
             return [ascending(opened.positions(first, axis)[::stride]) for axis in (1, 2, 3)]
 
         def RequestDataObject(self, request: Any, inputs: Any, outputs: Any) -> int:
@@ -344,6 +393,7 @@ else:
             opened = self._opened()
             if opened is None:
                 return 0
+            self._watch()
             told, executive = outputs.GetInformationObject(0), self.GetExecutive()
             times = self._times(opened)
             time = times[0]
@@ -377,12 +427,12 @@ else:
                         len(positions) - 1 - first,
                     )
                 )
-                region += [ends[0] << self._lod, (ends[1] << self._lod) + 1]
+                region += [ends[0] << self._level, (ends[1] << self._level) + 1]
                 turns.append(slice(None, None, turn))
             fields = []
             for number in self._chosen(opened):
                 variable = opened.variables[number]
-                values = opened.read(number, step, region, self._lod)[tuple(turns)]
+                values = opened.read(number, step, region, self._level)[tuple(turns)]
                 fields.append((variable.name.decode(), variable.units.decode(), values))
             corner = (extent[4], extent[2], extent[0])
             return vtk_grid(fields, [positions for positions, _ in axes], corner)

@@ -76,5 +76,21 @@ for _ in times:
     played.append(view.ViewTime)
     scene.GoToNext()
 result["played"] = played
+
+
+def points() -> int:
+    """Points of the reader's output now."""
+    output = reader.SMProxy.GetClientSideObject().GetOutputDataObject(0)
+    return int(output.GetNumberOfPoints())
+
+
+reader.LevelWhileMoving = 2
+simple.Render(view)
+result["moving"] = [points()]
+interactor = view.GetInteractor()
+interactor.LeftButtonPressEvent()
+result["moving"].append(points())
+interactor.LeftButtonReleaseEvent()
+result["moving"].append(points())
 simple.SaveScreenshot(PICTURE, view)
 print("RESULT " + json.dumps(result))
