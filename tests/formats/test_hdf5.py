@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -195,6 +196,18 @@ def test_a_damaged_chunk_is_an_error_and_never_a_crash(first: int, tmp_path: Pat
         file["v"].id.write_direct_chunk((0, 0, 0), sound[:5])
     shown = run("h5dump", "--enable-error-stack", tmp_path / "a.h5", code=1)
     assert "fhash(): fhash: " in shown
+
+
+def test_damaged_numbers_of_a_dataset_are_an_error(tmp_path: Path) -> None:
+    values = noise((2, 6, 7), "f4")
+    store(tmp_path / "a.h5", values, Transform(max_error=0.5), chunks=(2, 6, 7))
+    data = bytearray((tmp_path / "a.h5").read_bytes())
+    shape = struct.pack("<4I", 1, 2, 6, 7)
+    assert data.count(shape) == 1
+    data[data.index(shape) + 4] = 1  # HDF5 would read beyond the half that is decoded
+    (tmp_path / "b.h5").write_bytes(data)
+    with h5py.File(tmp_path / "b.h5") as file, pytest.raises(OSError, match="filter"):
+        file["v"][...]
 
 
 def test_hdf5_tools_read_and_write(tmp_path: Path) -> None:

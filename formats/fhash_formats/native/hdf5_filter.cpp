@@ -15,12 +15,15 @@
 //     7-10   vertices of a chunk along t, z, y, x; of more axes, t has the leading ones
 //     11     1 where the dataset has a fill value, else 0
 //     12, 13 bits of the fill value, the lower 32 first
+//     14     CRC-32C of those before, in little-endian bytes: HDF5 would take values of another type,
+//            or of fewer bytes than it needs, without a word
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
 #include <utility>
 
 #include "core.hpp"
+#include "kernels.hpp"
 #include "status.hpp"
 
 #if defined(_WIN32)
@@ -33,7 +36,7 @@ namespace {
 
 // Not registered: of the range that is free for private use. FHASH on the keys of a telephone.
 const int FILTER = 34274;
-const unsigned GIVEN = 5, NUMBERS = 14;
+const unsigned GIVEN = 5, NUMBERS = 15;
 const unsigned REVERSE = 0x100;  // flag of HDF5: decode
 const int64_t MOST_VALUES = 1 << 27;
 const fhash_quality EXACT = {0, 0, 0, 2, 0};
@@ -163,6 +166,13 @@ int32_t known_type(const Hdf5& hdf5, Id type) {
     return ieee ? FHASH_FLOAT16 + log - 1 : 0;
 }
 
+// The number that stands behind those of a dataset.
+unsigned checksum(const unsigned* numbers) {
+    uint8_t bytes[4 * (NUMBERS - 1)];
+    for (size_t i = 0; i < sizeof bytes; i++) bytes[i] = (uint8_t)(numbers[i / 4] >> 8 * (i % 4));
+    return (unsigned)fhash_crc32c(bytes, sizeof bytes, 0, 0);
+}
+
 // Adds the numbers of a dataset to those of the user.
 bool complete(const Hdf5& hdf5, Id properties, Id type, unsigned* numbers, unsigned& flags,
               fhash_error& error) {
@@ -209,6 +219,7 @@ bool complete(const Hdf5& hdf5, Id properties, Id type, unsigned* numbers, unsig
     for (size_t i = 0; i < size; i++) bits = bits << 8 | fill[i];
     numbers[12] = (unsigned)bits;
     numbers[13] = (unsigned)(bits >> 32);
+    numbers[14] = checksum(numbers);
     return true;
 }
 
@@ -241,7 +252,8 @@ struct Chunk {
 };
 
 bool read_chunk(const unsigned* numbers, size_t count, Chunk& chunk, fhash_error& error) {
-    if (count < NUMBERS || numbers[0] != 1 || !fhash_type_size((int32_t)numbers[5])) {
+    if (count < NUMBERS || numbers[14] != checksum(numbers) ||
+        !fhash_type_size((int32_t)numbers[5])) {
         return fail(error, FHASH_ERROR_DAMAGED, "the numbers of the dataset are damaged");
     }
     chunk.tile = {};
