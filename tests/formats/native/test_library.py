@@ -109,14 +109,32 @@ def test_the_example_of_octave_reads_a_region(container: Path, tmp_path: Path) -
     assert "refused fhash_read: the file cannot be opened" in run(*words, line)
 
 
-def test_pkg_config_and_cmake_link_with_the_package(container: Path, tmp_path: Path) -> None:
-    words = ["pkg-config", f"--with-path={FOLDER}", "--cflags", "--libs", "fhash"]
-    assert run(*words).split() == [f"-I{FOLDER}", f"-L{FOLDER}", "-lfhash"]
+@pytest.mark.parametrize("place", ["package", "make lib"])
+def test_pkg_config_and_cmake_find_the_library(place: str, container: Path, tmp_path: Path) -> None:
+    system = ROOT / "build" / "lib" / "lib"
+    if place == "make lib" and not system.is_dir():
+        pytest.skip("`make lib` was not run")
+    package, library, config = (
+        (FOLDER, FOLDER, FOLDER)
+        if place == "package"
+        else (system / "pkgconfig", system, system / "cmake" / "fhash")
+    )
+    words = ["pkg-config", f"--with-path={package}", "--cflags", "--libs"]
+    flags = [Path(flag[2:]).resolve() for flag in run(*words, "fhash").split() if "/" in flag]
+    assert flags[1:] == [library]
+    assert (flags[0] / "fhash.h").is_file()
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(example C)\nfind_package(fhash 1.0 REQUIRED)"
         f"\nadd_executable(example {EXAMPLES / 'read_region.c'})"
         "\ntarget_link_libraries(example fhash::fhash m)"
     )
-    run("cmake", f"-Dfhash_DIR={FOLDER}", "-S", tmp_path, "-B", tmp_path / "build")
+    run("cmake", f"-Dfhash_DIR={config}", "-S", tmp_path, "-B", tmp_path / "build")
     run("cmake", "--build", tmp_path / "build")
     check(run(tmp_path / "build" / "example", container), container)
+    if place == "make lib":
+        static = run(*words, "--static", "fhash").replace("-lfhash", f"{library / 'libfhash.a'}")
+        source = EXAMPLES / "read_region.c"
+        run("gcc", source, *static.split(), "-lm", "-o", tmp_path / "static")
+        assert "fhash" not in run("ldd", tmp_path / "static")
+        check(run(tmp_path / "static", container), container)
+        assert (library / "hdf5/plugin/libh5fhash.so").resolve().is_file()
