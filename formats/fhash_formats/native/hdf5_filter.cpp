@@ -15,8 +15,8 @@
 //     7-10   vertices of a chunk along t, z, y, x; of more axes, t has the leading ones
 //     11     1 where the dataset has a fill value, else 0
 //     12, 13 bits of the fill value, the lower 32 first
-//     14     CRC-32C of those before, in little-endian bytes: HDF5 would take values of another type,
-//            or of fewer bytes than it needs, without a word
+//     14     CRC-32C of those before, in little-endian bytes: HDF5 would take values of another
+//            type, or of fewer bytes than it needs, without a word
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
