@@ -286,9 +286,10 @@ else:
             opened = self._opened()
             return [] if opened is None else [float(time) for time in self._times(opened)]
 
-        @property
-        def _level(self) -> int:
-            return max(self._lod, self._moving_lod) if self._moving else self._lod
+        def _level(self, opened: File) -> int:
+            """The level of detail that is asked for, or the last one that the variables have."""
+            asked = max(self._lod, self._moving_lod) if self._moving else self._lod
+            return min(asked, *(opened.variables[n].levels for n in self._chosen(opened)))
 
         def _watch(self) -> None:
             """Observe the views of this process, which a server has not."""
@@ -358,7 +359,7 @@ else:
 
         def _axes(self, opened: File) -> list[tuple[Any, int]]:
             """Positions along z, y and x at the level of detail, and how they were turned."""
-            first, stride = self._chosen(opened)[0], 1 << self._level
+            first, stride = self._chosen(opened)[0], 1 << self._level(opened)
             return [ascending(opened.positions(first, axis)[::stride]) for axis in (1, 2, 3)]
 
         def RequestDataObject(self, request: Any, inputs: Any, outputs: Any) -> int:
@@ -414,7 +415,7 @@ else:
 
         def _grid(self, opened: File, step: float, extent: list[int]) -> Any:
             """The grid of an extent x0, x1, y0, y1, z0, z1 of whole numbers, both ends within."""
-            axes = self._axes(opened)
+            axes, level = self._axes(opened), self._level(opened)
             region, turns = [], []
             for (positions, turn), first, last in zip(  # noqa: B905
                 axes, extent[4::-2], extent[5::-2]
@@ -427,12 +428,12 @@ else:
                         len(positions) - 1 - first,
                     )
                 )
-                region += [ends[0] << self._level, (ends[1] << self._level) + 1]
+                region += [ends[0] << level, (ends[1] << level) + 1]
                 turns.append(slice(None, None, turn))
             fields = []
             for number in self._chosen(opened):
                 variable = opened.variables[number]
-                values = opened.read(number, step, region, self._level)[tuple(turns)]
+                values = opened.read(number, step, region, level)[tuple(turns)]
                 fields.append((variable.name.decode(), variable.units.decode(), values))
             corner = (extent[4], extent[2], extent[0])
             return vtk_grid(fields, [positions for positions, _ in axes], corner)

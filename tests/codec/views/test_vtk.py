@@ -95,6 +95,7 @@ def test_paraview_plays_a_file_and_shows_its_bits(run: Path, tmp_path: Path) -> 
             assert shown["hidden"] == np.isnan(values["theta"]).sum() > 0
             assert shown["fields"] == {"theta units": "K", "speed units": "m s-1"}
         assert result["coarse"]["points"] == 5 * 12 * 20
+        assert result["coarsest"]["points"] < result["coarse"]["points"]
         assert result["one"]["digests"] == {"theta": digest(dataset["theta"].read(0)[:, ::-1])}
     assert result["moving"] == [9 * 24 * 40, 3 * 6 * 10, 9 * 24 * 40]
     assert picture.read_bytes().startswith(b"\x89PNG")
