@@ -289,7 +289,7 @@ else:
         def _level(self, opened: File) -> int:
             """The level of detail that is asked for, or the last one that the variables have."""
             asked = max(self._lod, self._moving_lod) if self._moving else self._lod
-            return min(asked, *(opened.variables[n].levels for n in self._chosen(opened)))
+            return min(asked, *(int(opened.variables[n].levels) for n in self._chosen(opened)))
 
         def _watch(self) -> None:
             """Observe the views of this process, which a server has not."""
