@@ -56,6 +56,10 @@ struct IntegerCoding {
 bool encode_integers(std::vector<int32_t>& integers, const Shape& shape, const Table& table,
                      const IntegerCoding& how, Buffer& out, fhash_error& error);
 
+// Codes predicted integers, which become what the bytes decode to where they do not count.
+bool encode_predicted(const Predictor& predictor, const Shape& shape, const uint8_t* counted,
+                      std::vector<int32_t>& integers, Buffer& out, fhash_error& error);
+
 // What a search on a tile needs.
 template <class T> struct Search {
     fhash_context& context;
