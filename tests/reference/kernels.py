@@ -274,6 +274,24 @@ def encode_integers(
     return Encoded(data=with_room(given.size // 2, encode), integers=integers)
 
 
+NEXT = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]])
+"""FORMAT.md, Two quantisers."""
+
+
+def of_two_quantisers(indices: Integers, table: Table) -> Integers:
+    """The integers whose indices these are, in the bands of a table; 0 elsewhere."""
+    result, state = np.zeros_like(indices), 0
+    for row in table:
+        box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
+        band = indices[box]
+        values = np.empty(band.size, np.int32)
+        for at, k in enumerate(band.ravel().tolist()):
+            values[at] = np.sign(k) * (2 * abs(k) - (state & 1))
+            state = NEXT[state, k & 1]
+        result[box] = values.reshape(band.shape)
+    return result
+
+
 def with_room(room: int, encode: Callable[[Buffer], int]) -> bytes:
     """The bytes of a native encoder, which is called again where they do not fit.
 

