@@ -63,8 +63,8 @@ lost-sync formats/fhash_formats/support/files.py
 _sync(output.temporary) => pass
 band-axis formats/fhash_formats/transform/lifting.py
 (0, int(key.z > 1), 0, 0) => (int(key.z > 1), 0, 0, 0)
-final-clip formats/fhash_formats/transform/decoding.py
-clipped(decoded, settings.low, settings.high) if settings.clip else decoded => decoded
+final-clip formats/fhash_formats/native/numbers.hpp
+const O raised = values[i] < low ? low : values[i]; => const O raised = values[i];
 axes-back formats/fhash_formats/transform/stream.py
 ordered.transpose(np.argsort(self._order)) => ordered.transpose(self._order)
 coder-sign formats/fhash_formats/native/coder.cpp

@@ -12,7 +12,6 @@ from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.transform.coder import MAX_LABELS
 from fhash_formats.transform.tile_format import (
     EMPTY,
-    EXACT,
     FAST,
     LABELS,
     MASKED,
@@ -27,12 +26,9 @@ from fhash_formats.transform.tile_format import (
     varint,
 )
 from reference.kernels import (
-    Levels,
     decode_labels,
-    decode_mask,
     encode_integers,
     encode_labels,
-    encode_mask,
     single_band,
 )
 
@@ -75,23 +71,6 @@ def build_stream(
         sections.append(encode_integers(residual, single_band(residual.shape), fast=fast).data)
     if mask is not None and kind != EMPTY:
         sections.append(mask)
-    return seal(flags, sections)
-
-
-def build_exact_stream(
-    values: Values, settings: TileSettings | None, occupied: Mask | None
-) -> bytes:
-    """The stream of a tile stored without loss.
-
-    Args:
-        values: the tile (t, z, y, x).
-        settings: the tile's own settings; None for none.
-        occupied: the mask; None for a stream without one.
-    """
-    flags, sections = _head(EXACT, settings, occupied is not None)
-    sections.append(pack_planes(values))
-    if occupied is not None:
-        sections.append(pack_mask(occupied, zero_levels(values.shape)))
     return seal(flags, sections)
 
 
@@ -147,27 +126,6 @@ def restore_missing(decoded: Values, missing: bytes | memoryview | None) -> Valu
         for mark, value in enumerate(_MISSING_VALUES, start=1):
             decoded[marks == mark] = value
     return decoded
-
-
-def zero_levels(shape: tuple[int, ...]) -> tuple[Levels, Levels]:
-    """Levels of a mask that no decoded values say anything about."""
-    return np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-
-
-def pack_mask(occupied: Mask, levels: tuple[Levels, Levels]) -> bytes:
-    """The section of a mask; empty where all values are occupied.
-
-    levels: how likely each value is occupied (`MaskLevels.levels`).
-    """
-    if occupied.all():
-        return b""
-    # The decoder reads zeros past the end, so one zero stands for an empty code.
-    return encode_mask(occupied, levels) or b"\0"
-
-
-def unpack_mask(packed: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
-    """The mask in a section."""
-    return decode_mask(packed, levels) if len(packed) else np.ones(levels[0].shape, bool)
 
 
 def labelled_stream(

@@ -318,7 +318,7 @@ FHASH_TWO_CLONES int64_t decode_two(const Task& task) { return run<DECODE, true>
 
 }  // namespace
 
-// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (transform/lifting.py).
+// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (plan.cpp).
 // Integers outside the bands count as 0.
 //
 // scaled: null, or coefficients / step: then the magnitudes are chosen anew and written to q.

@@ -204,7 +204,8 @@ bool encode_foretold(const Task& task, Coded& coded, fhash_error& error) {
     if (!foretold_integers(task, predictor, integers))
         return encode_task_exactly(task, coded, error);
     Buffer body;
-    if (!encode_predicted(predictor, task.shape, task.counts(), integers, body, error)) return false;
+    if (!encode_predicted(predictor, task.shape, task.counts(), integers, body, error))
+        return false;
     std::vector<double> linear((size_t)task.size());
     for (size_t i = 0; i < linear.size(); i++) {
         const double value = (double)integers[i] * predictor.step + predictor.origin;

@@ -20,7 +20,7 @@ Decode* decoder() { return fhash_fast_decode_baseline; }
 
 }  // namespace
 
-// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (transform/lifting.py), or
+// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (plan.cpp), or
 // foretell what that takes. Integers outside the bands count as 0.
 //
 // values, scale, weight: null, or what integers are chosen of: values times scale, in steps, where

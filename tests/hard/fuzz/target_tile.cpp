@@ -13,7 +13,7 @@ namespace {
 
 using Bytes = std::vector<std::uint8_t>;
 
-const std::int64_t MOST = 1 << 15, MOST_ENCODED = 1 << 11;  // vertices
+const std::int64_t MOST = 1 << 13, MOST_ENCODED = 1 << 9;  // vertices
 
 fhash_context* context() {
     static fhash_context* const one = fhash_context_create(1 << 28, 2);
