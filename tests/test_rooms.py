@@ -30,9 +30,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_formats.transform": (
         ("coder", "head", "values"),
         ("predict", "spec"),
-        ("lifting", "tile_format"),
-        ("decoding",),
-        ("encoding",),
+        ("tile_format",),
+        ("tile",),
         ("chunk", "stream"),
         ("numcodecs_codec", "zarr_codec"),
     ),

@@ -27,6 +27,7 @@ from documents import (
     replaced,
     stored,
 )
+from reference.sections import pack_planes
 
 from fhash_formats.container.array import ArrayMetadata, Sharding, pack_index, parse_index
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
@@ -47,7 +48,6 @@ from fhash_formats.transform.tile_format import (
     TRANSFORMED,
     TileSettings,
     TileStream,
-    pack_planes,
     parse_stream,
     read_varint,
     seal,

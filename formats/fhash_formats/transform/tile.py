@@ -39,8 +39,9 @@ It is the mean over coefficients of many series, which differ by 3 or less.
 DENSITIES = (1, 2, 4, 8)
 """Thresholds per factor of two with which values may be filled."""
 
-_MEMORY, _DAMAGED = -2, -3
-"""Statuses of the native library (fhash.h)."""
+_MEMORY = -2
+_DAMAGED = -3
+"""Status of the native library (fhash.h), as the one before."""
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 """Types of arrays in the order of their numbers in fhash.h, from 1."""
 
@@ -93,7 +94,7 @@ class _Tile(ctypes.Structure):
 
 @lru_cache
 def _context(threads: int) -> ctypes.c_void_p:
-    """What calls that use so many threads share."""
+    """The context of calls that use so many threads."""
     return ctypes.c_void_p(native.library().fhash_context_create(0, threads))
 
 

@@ -69,7 +69,7 @@ class TileSettings:
         labels: whether tiles are also tried as labels, without loss. Decoding needs none of it; a
             file that grows goes on as it began.
         trellis: whether coefficients are quantised by two quantisers in turn
-            (encoding.py). Integers are then in steps, of which each quantiser has every
+            (native/trellis.cpp). Integers are then in steps, of which each quantiser has every
             other one.
         origin: integer that is subtracted from the values before anything else, for arrays of
             64-bit integers alone; `center`, `low` and `high` are then those of the differences.
@@ -373,10 +373,6 @@ _ALLOWED = {
 """Flags that a stream of each kind may have."""
 _CHECKSUM = 4
 """Bytes of the checksum."""
-_MARKS = 4
-"""Labels of missing values."""
-_MISSING_VALUES = (np.nan, np.inf, -np.inf)
-"""Values with the labels 1, 2 and 3."""
 
 
 @dataclass(frozen=True, kw_only=True)
