@@ -6,14 +6,18 @@ the package ziglang is used (build_backend.py); it also compiles for other machi
 FHASH_TARGET names one by zig's words, such as aarch64-linux-musl (`make wheels`).
 """
 
+import hashlib
+import json
 import os
+import re
+import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from setuptools import Extension, setup
+from setuptools import Command, Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 from setuptools.errors import BaseError, CCompilerError, CompileError
@@ -49,6 +53,26 @@ would lie beside them."""
 NETWORK_FLAGS = ("-ffp-contract=fast", "-pthread")
 """Fused multiply-adds, and threads, for the network alone: no stream depends on its bits."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
+
+
+WASM = Path("fhash_codec/views/page/fhash.wasm")
+"""The decoder of `fhash view`, and beside it in .json what it was made from (`make wasm`)."""
+WASM_FLAGS = [
+    "--target=wasm32-wasi",
+    "-msimd128",
+    "-O2",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fvisibility=hidden",
+    "-ffunction-sections",
+    "-fdata-sections",
+    "-g0",
+]
+WASM_CPP_FLAGS = ["-std=c++17", "-fno-exceptions", "-fno-rtti", "-include", f"{FORMATS}/wasm.hpp"]
+WASM_LINK_FLAGS = ["-mexec-model=reactor", "-Wl,-s,--gc-sections,--stack-first,-z,stack-size=1048576"]
+WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
+"""Functions that a page has no use for: there are no paths, and nothing is encoded."""
 
 
 def use_zig() -> None:
@@ -116,6 +140,46 @@ class PlainWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
+class BuildWasm(Command):
+    """`wasm`: the functions of fhash.h for browsers, by Clang 14 and the libraries of wasi."""
+
+    description = "compile the decoder of the page of `fhash view`"
+    user_options: list[tuple[str, str | None, str]] = []
+
+    def initialize_options(self) -> None:
+        """Nothing can be chosen."""
+
+    def finalize_options(self) -> None:
+        """Nothing can be chosen."""
+
+    def run(self) -> None:
+        build = Path("build/wasm")
+        build.mkdir(parents=True, exist_ok=True)
+        sources = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
+
+        def compiled(source: Path) -> Path:
+            result = build / f"{source.name}.o"
+            kind = [] if source.suffix == ".c" else WASM_CPP_FLAGS
+            clang = "clang-14" if source.suffix == ".c" else "clang++-14"
+            self._run(clang, *WASM_FLAGS, *kind, f"-I{FORMATS}", "-c", source, "-o", result)
+            return result
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            objects = list(pool.map(compiled, sources))
+        declared = re.findall(r"FHASH_API [^;(]*?(fhash_\w+)\(", (FORMATS / "fhash.h").read_text("utf-8"))
+        names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
+        exports = [f"-Wl,--export={name}" for name in names]
+        self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
+        read = sorted([*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h")])
+        digests = {
+            path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in [*read, WASM]
+        }
+        WASM.with_suffix(".wasm.json").write_text(json.dumps(digests, indent=1) + "\n", "utf-8")
+
+    def _run(self, *words: str | Path) -> None:
+        subprocess.run([str(word) for word in words], check=True)
+
+
 def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension:
     """The library of all C++ sources in a folder.
 
@@ -138,6 +202,6 @@ setup(
         native("fhash_codec.native._codec", CODEC, flags=("-pthread",)),
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
-    cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel},
+    cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel, "wasm": BuildWasm},
     options={"build_ext": {"parallel": 3}},
 )
