@@ -52,6 +52,15 @@ GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if TARGET or sys.platform == "linux" els
 would lie beside them."""
 NETWORK_FLAGS = ("-ffp-contract=fast", "-pthread")
 """Fused multiply-adds, and threads, for the network alone: no stream depends on its bits."""
+THIRD_PARTY: list[tuple[str, str | None]] = [
+    ("yyjson_api", ""),
+    ("ZSTDLIB_VISIBLE", ""),
+    ("ZSTDERRORLIB_VISIBLE", ""),
+    ("ZSTD_DISABLE_ASM", "1"),
+    ("ZSTD_TRACE", "0"),
+    ("FHASH_BUILDING", "1"),
+]
+"""Definitions by which a library exports nothing of third_party, but its own public functions."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 
@@ -80,10 +89,11 @@ def use_zig() -> None:
     if find_spec("ziglang") is None:
         sys.exit("fhash needs a C++17 compiler: install g++ or clang++, or `pip install ziglang`")
     # Unless it is told otherwise, zig adds checks that trap, and compiles for this very processor.
-    compiler = f"{sys.executable} -m ziglang c++ -fno-sanitize=all -s"
-    compiler += f" -target {TARGET}" if TARGET else " -mcpu=baseline"
-    shared = f"{compiler} -shared"
-    os.environ |= {"CC": compiler, "CXX": compiler, "LDSHARED": shared, "LDCXXSHARED": shared}
+    flags = "-fno-sanitize=all -s"
+    flags += f" -target {TARGET}" if TARGET else " -mcpu=baseline"
+    c, cxx = (f"{sys.executable} -m ziglang {name} {flags}" for name in ("cc", "c++"))
+    shared = f"{cxx} -shared"
+    os.environ |= {"CC": c, "CXX": cxx, "LDSHARED": shared, "LDCXXSHARED": shared}
 
 
 class BuildNative(build_ext):
@@ -109,8 +119,14 @@ class BuildNative(build_ext):
     def _compile_in(self, pool: ThreadPoolExecutor) -> None:
         compile_some = self.compiler.compile
 
+        def compile_one(source: str, extra_postargs: list[str], **options: Any) -> list[str]:
+            if source.endswith(".c"):  # of others: C, and its warnings are theirs
+                own = [flag for flag in extra_postargs if not flag.startswith("-std=")]
+                extra_postargs = [*own, "-w"]
+            return list(compile_some([source], extra_postargs=extra_postargs, **options))
+
         def compile_each(sources: list[str], **options: Any) -> list[str]:
-            jobs = [pool.submit(compile_some, [source], **options) for source in sources]
+            jobs = [pool.submit(compile_one, source, **options) for source in sources]
             return [path for job in jobs for path in job.result()]
 
         self.compiler.compile = compile_each
@@ -181,16 +197,18 @@ class BuildWasm(Command):
 
 
 def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension:
-    """The library of all C++ sources in a folder.
+    """The library of all C++ sources in a folder, and of the C sources in its `third_party`.
 
     `flags` are added to those of every library, where the compiler is GCC or Clang.
     """
-    headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp")}
+    headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp"), *FORMATS.glob("*.h")}
+    others = sorted((folder / "third_party").glob("**/*.c"))
     return Extension(
         name,
-        sources=sorted(path.as_posix() for path in folder.glob("*.cpp")),
+        sources=[path.as_posix() for path in (*sorted(folder.glob("*.cpp")), *others)],
         depends=sorted(path.as_posix() for path in headers),
         include_dirs=[FORMATS.as_posix()],
+        define_macros=THIRD_PARTY if others else [],
         extra_compile_args=list(flags),
         language="c++",
     )

@@ -28,7 +28,8 @@ def sizes(rooms: list[str]) -> tuple[Counter[str], Counter[str]]:
     for root in ROOTS:
         for path in sorted((ROOT / root).rglob("*")):
             place = path.relative_to(ROOT)
-            if path.suffix not in SUFFIXES or place.parts[1] == "build":
+            others = place.parts[1] == "build" or "third_party" in place.parts
+            if path.suffix not in SUFFIXES or others:
                 continue
             inside = [each for each in rooms if place.is_relative_to(each)]
             assert inside, f"{place} lies in no room of {TABLE.name}"

@@ -20,6 +20,7 @@ NATIVE = sorted(
     for folder in ("fhash_codec", "formats", "tests")
     for suffix in ("cpp", "hpp", "c")
     for path in (ROOT / folder).rglob(f"*.{suffix}")
+    if "third_party" not in path.parts
 )
 HEADLESS = re.compile(
     r"\s*(Of|In|By|That|What|As|With|From|Where|When|How|Which|No|More|For|At|On|To|Than)\b"

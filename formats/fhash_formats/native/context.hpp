@@ -1,13 +1,15 @@
 // What calls share (fhash_context in fhash.h).
 #pragma once
 
+#include <array>
 #include <cstdint>
+#include <map>
 #include <memory>
-#include <mutex>
 #include <string>
 #include <vector>
 
 #include "status.hpp"
+#include "threads.hpp"
 
 namespace fhash {
 struct Settings;  // settings.hpp
@@ -16,9 +18,11 @@ struct Settings;  // settings.hpp
 struct fhash_context {
     uint64_t memory;  // bytes that a call may use beside the caller's arrays; 0 for no limit
     int32_t threads;
-    std::mutex lock;
+    fhash::Mutex lock;
     // Unpacked settings by their bytes, those used last in front.
     std::vector<std::pair<std::string, std::shared_ptr<const fhash::Settings>>> settings;
+    // Norms of wavelets by kind, depth and length (plan.cpp).
+    std::map<std::array<int64_t, 3>, std::shared_ptr<const std::vector<double>>> norms;
 };
 
 namespace fhash {

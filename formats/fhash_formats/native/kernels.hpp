@@ -1,0 +1,141 @@
+// The kernels that the order of a tile calls; each is described where it is defined.
+#pragma once
+
+#include "core.hpp"
+
+extern "C" {
+std::int64_t fhash_crc32c(const void*, std::int64_t, std::int64_t, std::int64_t);
+
+// coder.cpp, fast.cpp, labels.cpp, mask.cpp, mask_levels.cpp, predict.cpp
+std::int64_t fhash_encode(std::int32_t*, const float*, double, std::int64_t, const std::int64_t*,
+                          const std::int32_t*, std::int64_t, std::uint16_t*, std::int64_t,
+                          std::int32_t*, std::int64_t, std::uint16_t*, std::int64_t, std::int64_t,
+                          std::uint8_t*, std::int64_t);
+std::int64_t fhash_decode(std::int32_t*, std::int64_t, const std::int64_t*, const std::int32_t*,
+                          std::int64_t, const std::uint16_t*, std::int64_t, const std::int32_t*,
+                          std::int64_t, const std::uint16_t*, std::int64_t, const std::uint8_t*,
+                          std::int64_t);
+std::int64_t fhash_fast_encode(std::int32_t*, const float*, std::int64_t, double, double,
+                               const std::int64_t*, const std::int32_t*, std::int64_t,
+                               const std::uint16_t*, const std::uint8_t*, std::uint8_t*,
+                               std::int64_t, double*);
+std::int64_t fhash_fast_decode(std::int32_t*, std::int64_t, const std::int64_t*,
+                               const std::int32_t*, std::int64_t, const std::uint8_t*,
+                               const std::uint32_t*, const std::uint8_t*, std::int64_t);
+std::int64_t fhash_encode_mask(const std::uint8_t*, const std::uint8_t*, const std::uint8_t*,
+                               const std::int64_t*, std::uint16_t*, std::int64_t, std::int32_t*,
+                               std::int64_t, std::uint16_t*, std::int64_t, std::int64_t,
+                               std::uint8_t*, std::int64_t);
+std::int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*,
+                               const std::int64_t*, const std::uint16_t*, std::int64_t,
+                               const std::int32_t*, std::int64_t, const std::uint16_t*,
+                               std::int64_t, const std::uint8_t*, std::int64_t);
+std::int64_t fhash_mask_levels_f32(const float*, const std::int64_t*, const float*, std::int64_t,
+                                   const std::int32_t*, const std::int32_t*, std::int64_t,
+                                   std::uint8_t*, std::uint8_t*);
+std::int64_t fhash_mask_levels_f64(const double*, const std::int64_t*, const double*, std::int64_t,
+                                   const std::int32_t*, const std::int32_t*, std::int64_t,
+                                   std::uint8_t*, std::uint8_t*);
+std::int64_t fhash_encode_labels(std::uint16_t*, std::int64_t, const std::int64_t*, std::uint8_t*,
+                                 std::int64_t);
+std::int64_t fhash_decode_labels(std::uint16_t*, std::int64_t, const std::int64_t*,
+                                 const std::uint8_t*, std::int64_t);
+std::int64_t fhash_encode_predicted(std::int32_t*, const std::uint8_t*, const std::int64_t*,
+                                    const std::int64_t*, const std::int32_t*, std::int64_t,
+                                    const std::int32_t*, const std::int16_t*, const std::uint16_t*,
+                                    std::int64_t, const std::int32_t*, std::int64_t,
+                                    const std::uint16_t*, std::int64_t, std::uint8_t*,
+                                    std::int64_t);
+std::int64_t fhash_decode_predicted(std::int32_t*, const std::int64_t*, const std::int64_t*,
+                                    const std::int32_t*, std::int64_t, const std::int32_t*,
+                                    const std::int16_t*, const std::uint16_t*, std::int64_t,
+                                    const std::int32_t*, std::int64_t, const std::uint16_t*,
+                                    std::int64_t, const std::uint8_t*, std::int64_t);
+
+// lifting.cpp, head.cpp
+#define FHASH_TRANSFORM_ARGUMENTS(T) \
+    const std::int64_t*, const std::int64_t*, const std::int64_t*, const std::int64_t*, \
+        const T* const*, const T*, const T*
+std::int64_t fhash_transform_forward_f32(const float*, float*, FHASH_TRANSFORM_ARGUMENTS(float));
+std::int64_t fhash_transform_inverse_f32(const float*, float*, FHASH_TRANSFORM_ARGUMENTS(float));
+std::int64_t fhash_transform_forward_f64(const double*, double*,
+                                         FHASH_TRANSFORM_ARGUMENTS(double));
+std::int64_t fhash_transform_inverse_f64(const double*, double*,
+                                         FHASH_TRANSFORM_ARGUMENTS(double));
+std::int64_t fhash_reconstruct_f32(const std::int32_t*, float*, FHASH_TRANSFORM_ARGUMENTS(float),
+                                   const double*);
+std::int64_t fhash_reconstruct_f64(const std::int32_t*, double*, FHASH_TRANSFORM_ARGUMENTS(double),
+                                   const double*);
+std::int64_t fhash_head_apply(const float*, const std::int64_t*, std::int64_t, std::int64_t,
+                              std::int64_t, const std::int64_t*, const float*, const float*,
+                              const float*, const float*, std::int64_t, std::int64_t, float*);
+
+// quantise.cpp, values.cpp
+std::int64_t fhash_dequantise_f32(const std::int32_t*, std::int64_t, double, const double*, float*);
+std::int64_t fhash_dequantise_f64(const std::int32_t*, std::int64_t, double, const double*,
+                                  double*);
+std::int64_t fhash_clip_f32(float*, std::int64_t, double, double, double);
+std::int64_t fhash_clip_f64(double*, std::int64_t, double, double, double);
+std::int64_t fhash_correct_f32_f32(const float*, const std::int32_t*, std::int64_t, double, float*);
+std::int64_t fhash_correct_f32_f64(const float*, const std::int32_t*, std::int64_t, double,
+                                   double*);
+std::int64_t fhash_correct_f64_f32(const double*, const std::int32_t*, std::int64_t, double,
+                                   float*);
+std::int64_t fhash_correct_f64_f64(const double*, const std::int32_t*, std::int64_t, double,
+                                   double*);
+}
+
+// The kernels of a type by overloading.
+namespace fhash {
+
+#define FHASH_OVERLOADS(T, NAME) \
+    inline std::int64_t transform_inverse(const T* in, T* out, const std::int64_t* shape, \
+                                          const std::int64_t* kinds, const std::int64_t* depths, \
+                                          const std::int64_t* ranks, const T* const* matrices, \
+                                          const T* tz, const T* yx) { \
+        return fhash_transform_inverse_##NAME(in, out, shape, kinds, depths, ranks, matrices, tz, \
+                                              yx); \
+    } \
+    inline std::int64_t reconstruct(const std::int32_t* in, T* out, const std::int64_t* shape, \
+                                    const std::int64_t* kinds, const std::int64_t* depths, \
+                                    const std::int64_t* ranks, const T* const* matrices, \
+                                    const T* tz, const T* yx, const double* numbers) { \
+        return fhash_reconstruct_##NAME(in, out, shape, kinds, depths, ranks, matrices, tz, yx, \
+                                        numbers); \
+    } \
+    inline void dequantise(const std::int32_t* in, std::int64_t n, double step, \
+                           const double* shifts, T* out) { \
+        fhash_dequantise_##NAME(in, n, step, shifts, out); \
+    } \
+    inline void clip_shifted(T* values, std::int64_t n, double center, double low, double high) { \
+        fhash_clip_##NAME(values, n, center, low, high); \
+    } \
+    inline std::int64_t mask_levels(const T* values, const std::int64_t* shape, const T* edges, \
+                                    std::int64_t edge_count, const std::int32_t* scores, \
+                                    const std::int32_t* others, std::int64_t reach, \
+                                    std::uint8_t* first, std::uint8_t* second) { \
+        return fhash_mask_levels_##NAME(values, shape, edges, edge_count, scores, others, reach, \
+                                        first, second); \
+    }
+FHASH_OVERLOADS(float, f32)
+FHASH_OVERLOADS(double, f64)
+#undef FHASH_OVERLOADS
+
+inline void correct(const float* base, const std::int32_t* rest, std::int64_t n, double quantum,
+                    float* out) {
+    fhash_correct_f32_f32(base, rest, n, quantum, out);
+}
+inline void correct(const float* base, const std::int32_t* rest, std::int64_t n, double quantum,
+                    double* out) {
+    fhash_correct_f32_f64(base, rest, n, quantum, out);
+}
+inline void correct(const double* base, const std::int32_t* rest, std::int64_t n, double quantum,
+                    float* out) {
+    fhash_correct_f64_f32(base, rest, n, quantum, out);
+}
+inline void correct(const double* base, const std::int32_t* rest, std::int64_t n, double quantum,
+                    double* out) {
+    fhash_correct_f64_f64(base, rest, n, quantum, out);
+}
+
+}  // namespace fhash

@@ -1,0 +1,166 @@
+// What Python asks of a tile beside its values: its table, and parts of it (transform/decoding.py).
+#define FHASH_BUILDING
+#include <cmath>
+
+#include "core.hpp"
+#include "numbers.hpp"
+#include "tile.hpp"
+
+namespace fhash {
+namespace {
+
+constexpr int64_t SHARE = 4;  // a part is corrected alone where its head sees a SHARE-th of frames
+const int64_t REACH[4] = {1, 2, 2, 2};  // farthest vertices that the inputs of a head come from
+
+// A part: first vertices along t, z, y, x, and those after the last.
+struct Part {
+    int64_t first[4], last[4];
+
+    Shape shape() const {
+        return {last[0] - first[0], last[1] - first[1], last[2] - first[2], last[3] - first[3]};
+    }
+};
+
+// A part and what its head sees around it.
+Part widened(const Part& part, const Shape& shape, const Head& head) {
+    Part wide;
+    for (int a = 0; a < 4; a++) {
+        const int64_t reach = REACH[a] + head.cross;
+        wide.first[a] = std::max<int64_t>(0, part.first[a] - reach);
+        wide.last[a] = std::min(shape[(size_t)a], part.last[a] + reach);
+    }
+    return wide;
+}
+
+// A part of an array as an array of its own.
+template <class I, class O>
+std::vector<O> copied(const I* in, const Shape& shape, const Part& part) {
+    std::vector<O> out;
+    out.reserve((size_t)vertices(part.shape()));
+    for (int64_t t = part.first[0]; t < part.last[0]; t++)
+        for (int64_t z = part.first[1]; z < part.last[1]; z++)
+            for (int64_t y = part.first[2]; y < part.last[2]; y++) {
+                const I* const row = in + ((t * shape[1] + z) * shape[2] + y) * shape[3];
+                out.insert(out.end(), row + part.first[3], row + part.last[3]);
+            }
+    return out;
+}
+
+bool is_part(const int64_t* numbers, const Shape& shape, Part& part) {
+    for (int a = 0; a < 4; a++) {
+        part.first[a] = numbers[2 * a];
+        part.last[a] = numbers[2 * a + 1];
+        if (part.first[a] < 0 || part.first[a] >= part.last[a] || part.last[a] > shape[(size_t)a])
+            return false;
+    }
+    return true;
+}
+
+// The values of a tile in float32 or float64: those before the head where it is transformed, else
+// the values, of which the centre stands for those that are not finite.
+template <class T> bool table_of(Job& job, T* values, fhash_error& error) {
+    if (job.settings && job.stream.kind == TRANSFORMED) return decode_linear(job, values, error);
+    const int64_t n = vertices(job.out_shape());
+    const double center = job.settings ? job.settings->center : 0.0;
+    std::vector<uint8_t> coded((size_t)n * 8);
+    if (!decode_about_origin(job, coded.data(), nullptr, error)) return false;
+    return with_type(job.coded_type(), [&](auto type) {
+        const auto* const of = (const decltype(type)*)(const void*)coded.data();
+        for (int64_t i = 0; i < n; i++) {
+            const T value = (T)real(of[i]);
+            values[i] = std::isfinite(value) ? value : (T)center;
+        }
+        return true;
+    });
+}
+
+}  // namespace
+}  // namespace fhash
+
+using namespace fhash;
+
+// The table of a tile less its origin: see decode_tile_table.
+//
+// values: room for float64 numbers. wide: gets whether they are float64; else they are float32.
+// origin: gets the origin's bits, and whether it is negative.
+FHASH_EXPORT int32_t fhash_tile_table(fhash_context* context, const fhash_tile* tile,
+                                      const void* stream, size_t size, int32_t lod, void* values,
+                                      int32_t* wide, uint64_t* origin, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        Job job = {*context, {}, 0, lod, {}, nullptr};
+        if (!make_job(job, tile, stream, size, failed)) return false;
+        *wide = !job.settings || job.settings->real64;
+        origin[0] = job.settings ? job.settings->origin.bits : 0;
+        origin[1] = job.settings && job.settings->origin.negative;
+        return *wide ? table_of(job, (double*)values, failed)
+                     : table_of(job, (float*)values, failed);
+    });
+}
+
+// The values of a tile before its head, where nothing but fhash_tile_part is left to do.
+//
+// part: first and last vertex along t, z, y, x. values: room for float32 numbers of the tile.
+// done: gets whether there are such values; else the tile is as well decoded whole.
+FHASH_EXPORT int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
+                                            const void* stream, size_t size, const int64_t* part,
+                                            float* values, int32_t* done, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        Job job = {*context, {}, 0, 0, {}, nullptr};
+        *done = 0;
+        if (!make_job(job, tile, stream, size, failed)) return false;
+        Part some;
+        if (!is_part(part, job.shape, some))
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a part lies in its tile");
+        if (!job.settings || !job.settings->head) return true;
+        const Shape seen = widened(some, job.shape, *job.settings->head).shape();
+        const Shape& all = job.shape;
+        if (SHARE * seen[1] * seen[2] * seen[3] > all[1] * all[2] * all[3]) return true;
+        const Stream& of = job.stream;
+        if (of.kind != TRANSFORMED || of.masked || of.settings.at || of.missing.at ||
+            of.residual.at)
+            return true;
+        *done = 1;
+        return decode_linear(job, values, failed);
+    });
+}
+
+// A part of the values of a tile, as fhash_tile_decode gives them.
+//
+// table: what fhash_tile_uncorrected gave. values: room for the part, in the type of the tile.
+FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
+                                     const float* table, const int64_t* part, void* values,
+                                     fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
+                                              tile->settings_size, failed);
+        if (!settings) return false;
+        Shape shape;
+        std::copy_n(tile->shape, 4, shape.begin());
+        Part some;
+        if (!is_shape(tile->shape) || !is_part(part, shape, some) || !settings->head)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a part lies in its tile, which has a head");
+        // At the ends of the tile the head sees its edge either way; farther in, what it sees
+        // instead of what was cut off is cut off again.
+        const Part wide = widened(some, shape, *settings->head);
+        const std::vector<float> base = copied<float, float>(table, shape, wide);
+        std::vector<float> head(base.size());
+        if (!apply_head(*context, *settings->head, base.data(), wide.shape(), head.data(), failed))
+            return false;
+        Part inner;
+        for (int a = 0; a < 4; a++) {
+            inner.first[a] = some.first[a] - wide.first[a];
+            inner.last[a] = some.last[a] - wide.first[a];
+        }
+        const std::vector<float> kept = copied<float, float>(head.data(), wide.shape(), inner);
+        const int64_t n = (int64_t)kept.size();
+        const bool about = !settings->origin.zero();
+        const bool done = with_type(about ? FHASH_INT64 : tile->type, [&](auto type) {
+            auto* const out = (decltype(type)*)values;
+            cast_all(kept.data(), out, n);
+            clip_range(out, n, *settings);
+            return true;
+        });
+        if (done && about) add_origin((int64_t*)values, n, settings->origin, tile->type);
+        return done;
+    });
+}

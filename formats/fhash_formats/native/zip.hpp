@@ -1,0 +1,65 @@
+// Bytes of a file, and the members of its ZIP (FORMAT.md, ZIP), all of them checked.
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <unordered_map>
+#include <vector>
+
+#include "context.hpp"
+
+namespace fhash {
+
+using Bytes = std::vector<uint8_t>;
+
+// A file that the caller's function reads. Its end is kept: small files are read once.
+struct Source {
+    const fhash_context* context = nullptr;
+    fhash_read_function function = nullptr;
+    void* user = nullptr;
+    uint64_t size = 0;
+    uint64_t tail_at = 0;  // offset of `tail`
+    Bytes tail;
+
+    bool read_tail(fhash_error& error);
+    bool read(uint64_t offset, uint64_t length, uint8_t* bytes, fhash_error& error) const;
+    // The same, where the bytes count against the context's memory.
+    bool read(uint64_t offset, uint64_t length, Bytes& bytes, fhash_error& error) const;
+};
+
+// A file in the ZIP.
+struct Member {
+    std::string name;
+    uint64_t offset = 0;     // of the local header
+    uint64_t size = 0;       // bytes of the data in the ZIP
+    uint32_t crc = 0;        // CRC-32 of the full data
+    int64_t full_size = -1;  // bytes of the inflated data; -1 for data that are stored
+
+    uint64_t data_offset() const { return offset + 30 + name.size(); }
+    uint64_t end() const { return data_offset() + size; }
+};
+
+struct Directory {
+    std::vector<Member> members;  // in the order of the file
+    std::unordered_map<std::string, uint32_t> numbers;
+
+    const Member* find(const std::string& name) const;
+};
+
+bool read_directory(Source& source, Directory& found, fhash_error& error);
+
+// The full data of a member, checked. `stored`: its local header, name and data.
+bool open_member(const Member& member, const uint8_t* stored, Bytes& data, fhash_error& error);
+// The same, where the data are not deflated: they begin at data_offset() - offset.
+bool check_member(const Member& member, const uint8_t* stored, fhash_error& error);
+
+// SHA-256 of some bytes.
+void sha256(const uint8_t* data, size_t size, uint8_t digest[32]);
+
+inline uint64_t little(const uint8_t* bytes, int count) {
+    uint64_t value = 0;
+    for (int i = count - 1; i >= 0; i--) value = value << 8 | bytes[i];
+    return value;
+}
+
+}  // namespace fhash
