@@ -74,11 +74,12 @@ WASM_FLAGS = [
     "-fno-math-errno",
     "-fno-trapping-math",
     "-fvisibility=hidden",
+    "-Wno-macro-redefined",
     "-ffunction-sections",
     "-fdata-sections",
     "-g0",
 ]
-WASM_CPP_FLAGS = ["-std=c++17", "-fno-exceptions", "-fno-rtti", "-include", f"{FORMATS}/wasm.hpp"]
+WASM_CPP_FLAGS = ["-std=c++17", "-fno-exceptions", "-fno-rtti"]
 WASM_LINK_FLAGS = ["-mexec-model=reactor", "-Wl,-s,--gc-sections,--stack-first,-z,stack-size=1048576"]
 WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
 """Functions that a page has no use for: there are no paths, and nothing is encoded."""
@@ -173,9 +174,14 @@ class BuildWasm(Command):
         build.mkdir(parents=True, exist_ok=True)
         sources = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
 
+        headers = max(path.stat().st_mtime for path in [*FORMATS.rglob("*.h*"), Path(__file__)])
+
         def compiled(source: Path) -> Path:
             result = build / f"{source.name}.o"
-            kind = [] if source.suffix == ".c" else WASM_CPP_FLAGS
+            if result.exists() and result.stat().st_mtime > max(source.stat().st_mtime, headers):
+                return result
+            kind = [f"-D{name}={value}" for name, value in THIRD_PARTY]
+            kind += [] if source.suffix == ".c" else WASM_CPP_FLAGS
             clang = "clang-14" if source.suffix == ".c" else "clang++-14"
             self._run(clang, *WASM_FLAGS, *kind, f"-I{FORMATS}", "-c", source, "-o", result)
             return result
@@ -184,9 +190,11 @@ class BuildWasm(Command):
             objects = list(pool.map(compiled, sources))
         declared = re.findall(r"FHASH_API [^;(]*?(fhash_\w+)\(", (FORMATS / "fhash.h").read_text("utf-8"))
         names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
+        text = "".join(s.read_text("utf-8") for s in sources)
+        names = [n for n in names if n != "fhash_open" and n != "fhash_open_page" and f"{n}(" in text or n in ("malloc","free")]  # TEMP
         exports = [f"-Wl,--export={name}" for name in names]
         self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
-        read = sorted([*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h")])
+        read = sorted({*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")})
         digests = {
             path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in [*read, WASM]
         }
