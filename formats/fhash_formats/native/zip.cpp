@@ -20,16 +20,16 @@ constexpr size_t COMMENT = 79;                   // bytes of the comment of this
 constexpr uint64_t MAX_16 = 0xFFFF, MAX_32 = 0xFFFFFFFF;
 constexpr size_t LOCAL = 30, ENTRY = 46, END = 22, END_64 = 56, LOCATOR_64 = 20;
 
-void put(Bytes& bytes, uint64_t value, int count) {
+void put(Buffer& bytes, uint64_t value, int count) {
     for (int i = 0; i < count; i++) bytes.push_back(uint8_t(value >> 8 * i));
 }
 
-void put_name(Bytes& bytes, const std::string& name) {
+void put_name(Buffer& bytes, const std::string& name) {
     bytes.insert(bytes.end(), name.begin(), name.end());
 }
 
 // What local headers and entries have in common: version, flags, method, time, sizes, lengths.
-void put_fields(Bytes& bytes, const Member& member, int version, uint64_t extra) {
+void put_fields(Buffer& bytes, const Member& member, int version, uint64_t extra) {
     put(bytes, version, 2);
     put(bytes, 0, 2);
     put(bytes, member.full_size < 0 ? 0 : 8, 2);
@@ -42,18 +42,18 @@ void put_fields(Bytes& bytes, const Member& member, int version, uint64_t extra)
     put(bytes, extra, 2);
 }
 
-Bytes local_header(const Member& member) {
-    Bytes bytes;
+Buffer local_header(const Member& member) {
+    Buffer bytes;
     put(bytes, 0x04034b50, 4);
     put_fields(bytes, member, 20, 0);
     put_name(bytes, member.name);
     return bytes;
 }
 
-Bytes directory_entry(const Member& member) {
+Buffer directory_entry(const Member& member) {
     const bool far = member.offset >= MAX_32;
     const int version = far ? 45 : 20;
-    Bytes bytes;
+    Buffer bytes;
     put(bytes, 0x02014b50, 4);
     put(bytes, version | 3 << 8, 2);
     put_fields(bytes, member, version, far ? 12 : 0);
@@ -72,8 +72,8 @@ struct End {
     uint64_t count = 0, size = 0, offset = 0;  // of the directory
 };
 
-Bytes end_records(const End& end) {
-    Bytes bytes;
+Buffer end_records(const End& end) {
+    Buffer bytes;
     if (end.count >= MAX_16 || end.size >= MAX_32 || end.offset >= MAX_32) {
         put(bytes, 0x06064b50, 4);
         put(bytes, END_64 - 12, 8);
@@ -102,7 +102,7 @@ bool is_digit(uint8_t letter) { return letter >= '0' && letter <= '9'; }
 bool is_hex(uint8_t letter) { return is_digit(letter) || (letter >= 'a' && letter <= 'f'); }
 
 // Whether the file ends in the comment of a container; `start` is its offset in the tail.
-bool find_comment(const Bytes& tail, size_t& start, int& major) {
+bool find_comment(const Buffer& tail, size_t& start, int& major) {
     for (size_t digits = 1; digits <= 4; digits++) {
         const size_t length = 6 + digits + 8 + 64;
         if (length > tail.size()) return false;
@@ -124,18 +124,19 @@ bool read_end(const Source& source, uint64_t comment_at, End& end, fhash_error& 
     if (comment_at < END) return fail(error, FHASH_ERROR_DAMAGED, "the ZIP end record is missing");
     uint8_t record[END_64];
     if (!source.read(comment_at - END, END, record, error)) return false;
-    if (little(record, 4) != 0x06054b50 || little(record + 20, 2) != COMMENT)
+    if (from_little(record, 4) != 0x06054b50 || from_little(record + 20, 2) != COMMENT)
         return fail(error, FHASH_ERROR_DAMAGED, "the ZIP end record is damaged");
-    end = {little(record + 10, 2), little(record + 12, 4), little(record + 16, 4)};
+    end = {from_little(record + 10, 2), from_little(record + 12, 4), from_little(record + 16, 4)};
     uint64_t records_at = comment_at - END;
     if (end.count == MAX_16 || end.size == MAX_32 || end.offset == MAX_32) {
         if (records_at < LOCATOR_64 + END_64)
             return fail(error, FHASH_ERROR_DAMAGED, "the ZIP64 end record is missing");
         records_at -= LOCATOR_64 + END_64;
         if (!source.read(records_at, END_64, record, error)) return false;
-        if (little(record, 4) != 0x06064b50)
+        if (from_little(record, 4) != 0x06064b50)
             return fail(error, FHASH_ERROR_DAMAGED, "the ZIP64 end record is damaged");
-        end = {little(record + 32, 8), little(record + 40, 8), little(record + 48, 8)};
+        const uint8_t* const fields = record + 32;
+        end = {from_little(fields, 8), from_little(fields + 8, 8), from_little(fields + 16, 8)};
     }
     if (end.size > MAX_DIRECTORY || end.offset > records_at ||
         end.offset + end.size != records_at)
@@ -169,18 +170,18 @@ bool is_document(const std::string& name) {
 // one that a writer makes of the member.
 bool parse_entry(const uint8_t*& at, const uint8_t* stop, Member& member, fhash_error& error) {
     const size_t left = size_t(stop - at);
-    if (left < ENTRY || little(at, 4) != 0x02014b50)
+    if (left < ENTRY || from_little(at, 4) != 0x02014b50)
         return fail(error, FHASH_ERROR_DAMAGED, "the ZIP directory has a damaged entry");
-    const size_t name_size = little(at + 28, 2);
+    const size_t name_size = from_little(at + 28, 2);
     if (left - ENTRY < name_size || !is_name(at + ENTRY, name_size))
         return fail(error, FHASH_ERROR_DAMAGED,
                     "the ZIP directory has a name that is not allowed");
     member.name.assign(reinterpret_cast<const char*>(at + ENTRY), name_size);
-    const uint64_t method = little(at + 10, 2), full = little(at + 24, 4);
-    member.crc = uint32_t(little(at + 16, 4));
-    member.size = little(at + 20, 4);
+    const uint64_t method = from_little(at + 10, 2), full = from_little(at + 24, 4);
+    member.crc = uint32_t(from_little(at + 16, 4));
+    member.size = from_little(at + 20, 4);
     member.full_size = method == 8 ? int64_t(full) : -1;
-    member.offset = little(at + 42, 4);
+    member.offset = from_little(at + 42, 4);
     if (method == 8) {
         if (!is_document(member.name) || member.size >= full || full > MAX_DOCUMENT)
             return fail(error, FHASH_ERROR_DAMAGED, "member %s may not be deflated so",
@@ -189,9 +190,9 @@ bool parse_entry(const uint8_t*& at, const uint8_t* stop, Member& member, fhash_
         return fail(error, FHASH_ERROR_DAMAGED, "member %s has sizes that are not allowed",
                     member.name.c_str());
     }
-    if (member.offset == MAX_32 && little(at + 30, 2) == 12 && left - ENTRY - name_size >= 12)
-        member.offset = little(at + ENTRY + name_size + 4, 8);
-    const Bytes made = directory_entry(member);
+    if (member.offset == MAX_32 && from_little(at + 30, 2) == 12 && left - ENTRY - name_size >= 12)
+        member.offset = from_little(at + ENTRY + name_size + 4, 8);
+    const Buffer made = directory_entry(member);
     if (left < made.size() || std::memcmp(at, made.data(), made.size()))
         return fail(error, FHASH_ERROR_DAMAGED,
                     "member %s has fields in its directory entry that the format does not allow",
@@ -200,7 +201,7 @@ bool parse_entry(const uint8_t*& at, const uint8_t* stop, Member& member, fhash_
     return true;
 }
 
-bool parse_entries(const Bytes& bytes, const End& end, Directory& found, fhash_error& error) {
+bool parse_entries(const Buffer& bytes, const End& end, Directory& found, fhash_error& error) {
     const uint8_t* at = bytes.data();
     const uint8_t* stop = at + end.size;
     uint64_t position = 0;
@@ -227,7 +228,9 @@ bool parse_entries(const Bytes& bytes, const End& end, Directory& found, fhash_e
 
 bool Source::read_tail(fhash_error& error) {
     const uint64_t length = std::min(size, TAIL);
-    if (!read(size - length, length, tail, error)) return false;
+    Buffer bytes;
+    if (!read(size - length, length, bytes, error)) return false;
+    tail = std::move(bytes);
     tail_at = size - length;
     return true;
 }
@@ -249,7 +252,7 @@ bool Source::read(uint64_t offset, uint64_t length, uint8_t* bytes, fhash_error&
     return true;
 }
 
-bool Source::read(uint64_t offset, uint64_t length, Bytes& bytes, fhash_error& error) const {
+bool Source::read(uint64_t offset, uint64_t length, Buffer& bytes, fhash_error& error) const {
     if (offset > size || length > size - offset) return read(offset, length, nullptr, error);
     if (!may_use(*context, length, error)) return false;
     bytes.resize(size_t(length));
@@ -274,7 +277,7 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
                     "the file is of format %d.x; this library reads format 2.x", major);
     const uint64_t comment_at = source.tail_at + start;
     End end;
-    Bytes directory;
+    Buffer directory;
     if (!read_end(source, comment_at, end, error)) return false;
     // An entry takes several times its bytes, unpacked.
     if (!may_use(*source.context, 5 * end.size, error)) return false;
@@ -285,8 +288,8 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
     for (int i = 0; i < 32; i++) std::snprintf(text + 2 * i, 3, "%02x", digest[i]);
     if (std::memcmp(text, source.tail.data() + source.tail.size() - 64, 64))
         return fail(error, FHASH_ERROR_DAMAGED,
-                    "the ZIP directory is damaged: its SHA-256 differs from the one in the comment");
-    const Bytes records = end_records(end);
+                    "the ZIP directory is damaged: its SHA-256 differs from that in the comment");
+    const Buffer records = end_records(end);
     if (directory.size() - end.size != records.size() ||
         std::memcmp(directory.data() + end.size, records.data(), records.size()))
         return fail(error, FHASH_ERROR_DAMAGED,
@@ -295,7 +298,7 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
 }
 
 bool check_member(const Member& member, const uint8_t* stored, fhash_error& error) {
-    const Bytes header = local_header(member);
+    const Buffer header = local_header(member);
     if (std::memcmp(stored, header.data(), header.size()))
         return fail(error, FHASH_ERROR_DAMAGED, "member %s: its header differs from the directory",
                     member.name.c_str());
@@ -306,7 +309,7 @@ bool check_member(const Member& member, const uint8_t* stored, fhash_error& erro
     return true;
 }
 
-bool open_member(const Member& member, const uint8_t* stored, Bytes& data, fhash_error& error) {
+bool open_member(const Member& member, const uint8_t* stored, Buffer& data, fhash_error& error) {
     if (!check_member(member, stored, error)) return false;
     const uint8_t* start = stored + (member.data_offset() - member.offset);
     if (member.full_size < 0) {

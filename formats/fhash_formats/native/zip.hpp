@@ -1,4 +1,4 @@
-// Bytes of a file, and the members of its ZIP (FORMAT.md, ZIP), all of them checked.
+// Buffer of a file, and the members of its ZIP (FORMAT.md, ZIP), all of them checked.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace fhash {
 
-using Bytes = std::vector<uint8_t>;
+using Buffer = std::vector<uint8_t>;
 
 // A file that the caller's function reads. Its end is kept: small files are read once.
 struct Source {
@@ -19,12 +19,12 @@ struct Source {
     void* user = nullptr;
     uint64_t size = 0;
     uint64_t tail_at = 0;  // offset of `tail`
-    Bytes tail;
+    Buffer tail;
 
     bool read_tail(fhash_error& error);
     bool read(uint64_t offset, uint64_t length, uint8_t* bytes, fhash_error& error) const;
     // The same, where the bytes count against the context's memory.
-    bool read(uint64_t offset, uint64_t length, Bytes& bytes, fhash_error& error) const;
+    bool read(uint64_t offset, uint64_t length, Buffer& bytes, fhash_error& error) const;
 };
 
 // A file in the ZIP.
@@ -49,14 +49,14 @@ struct Directory {
 bool read_directory(Source& source, Directory& found, fhash_error& error);
 
 // The full data of a member, checked. `stored`: its local header, name and data.
-bool open_member(const Member& member, const uint8_t* stored, Bytes& data, fhash_error& error);
+bool open_member(const Member& member, const uint8_t* stored, Buffer& data, fhash_error& error);
 // The same, where the data are not deflated: they begin at data_offset() - offset.
 bool check_member(const Member& member, const uint8_t* stored, fhash_error& error);
 
 // SHA-256 of some bytes.
 void sha256(const uint8_t* data, size_t size, uint8_t digest[32]);
 
-inline uint64_t little(const uint8_t* bytes, int count) {
+inline uint64_t from_little(const uint8_t* bytes, int count) {
     uint64_t value = 0;
     for (int i = count - 1; i >= 0; i--) value = value << 8 | bytes[i];
     return value;

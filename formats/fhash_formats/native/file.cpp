@@ -1,0 +1,215 @@
+// Files (fhash.h): opening, header, variables and coordinates.
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+#include <new>
+
+#include "volume.hpp"
+
+#if defined(_WIN32)
+#define WIN32_LEAN_AND_MEAN
+#include <windows.h>
+#endif
+
+namespace fhash {
+
+namespace {
+
+constexpr uint64_t CACHE = 64 << 20;  // bytes of decoded chunks that are kept by default
+
+bool open_file(fhash_file& file, fhash_error& error) {
+    file.source.context = file.context;
+    file.cache.limit = file.context->memory ? file.context->memory / 2 : CACHE;
+    if (!read_directory(file.source, file.directory, error) ||
+        !read_hierarchy(file.source, file.directory, file.hierarchy, error) ||
+        !read_variables(file.hierarchy, file.variables, error))
+        return false;
+    return json_text(yyjson_obj_get(file.hierarchy.root, "fhash"), file.header) ||
+           fail(error, FHASH_ERROR_MEMORY, "no memory for the header");
+}
+
+// The file of a path, UTF-8.
+std::FILE* open_stream(const char* path) {
+#if defined(_WIN32)
+    wchar_t wide[32768];
+    if (!MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 32768)) return nullptr;
+    return _wfopen(wide, L"rb");
+#else
+    return std::fopen(path, "rb");
+#endif
+}
+
+bool seek(std::FILE* stream, uint64_t offset, int whence) {
+#if defined(_WIN32)
+    return _fseeki64(stream, int64_t(offset), whence) == 0;
+#else
+    return fseeko(stream, off_t(offset), whence) == 0;
+#endif
+}
+
+int64_t tell(std::FILE* stream) {
+#if defined(_WIN32)
+    return _ftelli64(stream);
+#else
+    return int64_t(ftello(stream));
+#endif
+}
+
+int32_t read_stream(void* user, uint64_t offset, uint64_t length, void* bytes) {
+    fhash_file& file = *static_cast<fhash_file*>(user);
+    std::FILE* const stream = static_cast<std::FILE*>(file.stream);
+    Guard guard(file.stream_lock);  // threads share the position
+    return !seek(stream, offset, SEEK_SET) ||
+           std::fread(bytes, 1, size_t(length), stream) != size_t(length);
+}
+
+// Position along an axis and the JSON object of its name and attributes.
+bool describe(const Variable& variable, int axis, std::string& text, fhash_error& error) {
+    const Array* const array = variable.find(COORDINATES[axis]);
+    const char* const axes[4] = {"time", "z", "y", "x"};
+    const Json rule = yyjson_obj_get(variable.header.find("coordinates"), axes[axis]);
+    const Json source = array ? array->attributes : rule;
+    const Json own = yyjson_obj_get(source, "name");
+    const std::string usual = array ? array->path : variable.dimensions[axis];
+    if (own && !yyjson_is_str(own))
+        return fail(error, FHASH_ERROR_DAMAGED, "the name of a coordinate is no text");
+    yyjson_mut_doc* const made = yyjson_mut_doc_new(nullptr);
+    yyjson_mut_val* const root = yyjson_mut_obj(made);
+    yyjson_mut_val* const attributes = yyjson_mut_obj(made);
+    yyjson_mut_doc_set_root(made, root);
+    yyjson_mut_obj_add_str(made, root, "name", own ? yyjson_get_str(own) : usual.c_str());
+    yyjson_obj_iter iter =
+        yyjson_obj_iter_with(array ? source : yyjson_obj_get(rule, "attributes"));
+    while (Json key = yyjson_obj_iter_next(&iter))
+        if (!array || !yyjson_equals_str(key, "name"))
+            yyjson_mut_obj_add(attributes, yyjson_val_mut_copy(made, key),
+                               yyjson_val_mut_copy(made, yyjson_obj_iter_get_val(key)));
+    yyjson_mut_obj_add_val(made, root, "attributes", attributes);
+    char* const written = yyjson_mut_write(made, 0, nullptr);
+    yyjson_mut_doc_free(made);
+    if (!written) return fail(error, FHASH_ERROR_MEMORY, "no memory for attributes");
+    text = written;
+    std::free(written);
+    return true;
+}
+
+}  // namespace
+
+bool read_positions(fhash_file& file, const Variable& variable, int axis, double* positions,
+                    fhash_error& error) {
+    const Array* const array = variable.find(COORDINATES[axis]);
+    if (!array) return header_positions(variable, axis, positions, error);
+    Region all;
+    all.last = array->shape;
+    Buffer bytes;
+    if (!read_region(file, *array, all, bytes, nullptr, error)) return false;
+    std::memcpy(positions, bytes.data(), bytes.size());
+    return true;
+}
+
+}  // namespace fhash
+
+using namespace fhash;
+
+int32_t fhash_open(fhash_context* context, fhash_read_function read, void* user, uint64_t size,
+                   fhash_file** file, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        if (!context || !read || !file)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a context, a function and a place for the "
+                                                      "file are needed");
+        *file = nullptr;
+        std::unique_ptr<fhash_file> made(new (std::nothrow) fhash_file());
+        if (!made) return fail(failed, FHASH_ERROR_MEMORY, "no memory");
+        made->context = context;
+        made->source.function = read;
+        made->source.user = user;
+        made->source.size = size;
+        if (!open_file(*made, failed)) return false;
+        *file = made.release();
+        return true;
+    });
+}
+
+int32_t fhash_open_path(fhash_context* context, const char* path, fhash_file** file,
+                        fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        if (!context || !path || !file)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a context, a path and a place for the file "
+                                                      "are needed");
+        *file = nullptr;
+        std::unique_ptr<fhash_file, void (*)(fhash_file*)> made(new (std::nothrow) fhash_file(),
+                                                                fhash_close);
+        if (!made) return fail(failed, FHASH_ERROR_MEMORY, "no memory");
+        std::FILE* const stream = open_stream(path);
+        made->context = context;
+        made->stream = stream;
+        made->source.function = read_stream;
+        made->source.user = made.get();
+        if (!stream || !seek(stream, 0, SEEK_END) || tell(stream) < 0)
+            return fail(failed, FHASH_ERROR_READ, "the file cannot be opened");
+        made->source.size = uint64_t(tell(stream));
+        if (!open_file(*made, failed)) return false;
+        *file = made.release();
+        return true;
+    });
+}
+
+void fhash_close(fhash_file* file) {
+    if (file && file->stream) std::fclose(static_cast<std::FILE*>(file->stream));
+    delete file;
+}
+
+const char* fhash_header(const fhash_file* file) { return file ? file->header.c_str() : nullptr; }
+
+int32_t fhash_variables(const fhash_file* file) {
+    return file ? int32_t(file->variables.size()) : 0;
+}
+
+int32_t fhash_variable_get(const fhash_file* file, int32_t number, fhash_variable* variable,
+                           fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        if (!file || !variable || number < 0 || number >= int32_t(file->variables.size()))
+            return fail(failed, FHASH_ERROR_ARGUMENT, "the file has no variable %d", number);
+        const Variable& found = file->variables[size_t(number)];
+        *variable = {};
+        variable->name = found.name.c_str();
+        variable->units = found.units.c_str();
+        variable->attributes = found.attributes.c_str();
+        variable->type = found.type;
+        variable->levels = detail_levels(found);
+        for (int a = 0; a < 4; a++) {
+            variable->shape[a] = found.shape[a];
+            variable->tile[a] = tile_length(found, a);
+        }
+        std::copy(found.box, found.box + 6, variable->box);
+        variable->low = found.range[0];
+        variable->high = found.range[1];
+        variable->background = found.background;
+        variable->max_error = found.max_error;
+        variable->psnr = found.psnr;
+        return true;
+    });
+}
+
+int32_t fhash_coordinate(fhash_file* file, int32_t number, int32_t axis, double* positions,
+                         const char** attributes, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        if (!file || number < 0 || number >= int32_t(file->variables.size()) || axis < 0 ||
+            axis > 3 || !positions)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "the file has no such axis");
+        const Variable& variable = file->variables[size_t(number)];
+        if (!read_positions(*file, variable, axis, positions, failed)) return false;
+        if (!attributes) return true;
+        std::string text;
+        if (!describe(variable, axis, text, failed)) return false;
+        Guard guard(file->lock);
+        for (const std::string& known : file->texts)
+            if (known == text) {
+                *attributes = known.c_str();
+                return true;
+            }
+        file->texts.push_back(text);
+        *attributes = file->texts.back().c_str();
+        return true;
+    });
+}

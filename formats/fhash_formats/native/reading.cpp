@@ -1,0 +1,320 @@
+// fhash_read: values of a region at a step, or between two steps.
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "numbers.hpp"
+#include "volume.hpp"
+
+namespace fhash {
+
+namespace {
+
+constexpr double TWO_63 = 9223372036854775808.0;
+
+// A call of fhash_read. The lattice is that of the region, in vertices of the domain; `common` is
+// its part within the box, in vertices of the box, and `at` where that part begins in it.
+struct Call {
+    fhash_file& file;
+    const Variable& variable;
+    double step;
+    int32_t type;
+    uint8_t* values;
+    Lattice lattice, common;
+    int64_t at[3] = {};
+
+    bool integers() const { return type < FHASH_FLOAT16; }
+};
+
+bool set_lattice(Call& call, const int64_t* region, int lod, fhash_error& error) {
+    const int64_t every = int64_t(1) << lod;
+    call.lattice.lod = call.common.lod = lod;
+    for (int a = 0; a < 3; a++) {
+        const int64_t length = call.variable.shape[a + 1];
+        const int64_t low = region ? region[2 * a] : 0, high = region ? region[2 * a + 1] : length;
+        const int64_t* const box = call.variable.box + 2 * a;
+        if (low < 0 || low >= high || high > length)
+            return fail(error, FHASH_ERROR_ARGUMENT,
+                        "region %lld:%lld of axis %c is empty or outside 0:%lld", (long long)low,
+                        (long long)high, "zyx"[a], (long long)length);
+        const int64_t first = (low + every - 1) / every * every;
+        const int64_t count = (high - first + every - 1) / every;
+        if (count < 1)
+            return fail(error, FHASH_ERROR_ARGUMENT,
+                        "region %lld:%lld of axis %c holds no multiple of %lld", (long long)low,
+                        (long long)high, "zyx"[a], (long long)every);
+        const auto number = [&](int64_t vertex) {
+            return vertex <= first ? 0 : std::min(count, (vertex - first + every - 1) / every);
+        };
+        const int64_t begin = number(box[0]), end = number(box[1]);
+        call.lattice.first[a] = first;
+        call.lattice.count[a] = count;
+        call.at[a] = begin;
+        call.common.first[a] = first + begin * every - box[0];
+        call.common.count[a] = end - begin;
+    }
+    for (int a = 0; a < 3; a++)
+        if (call.common.count[a] < 1) call.common.count[0] = 0;
+    return true;
+}
+
+// Takes out of a mask the vertices that had no finite value at a step or one beside it.
+bool take_missing(const Call& call, Buffer& mask, fhash_error& error) {
+    const Array* const array = call.variable.find("missing/bits");
+    if (!array) return true;
+    const int64_t* const shape = call.variable.shape;
+    const int64_t* const box = call.variable.box;
+    const Lattice& common = call.common;
+    Region row;
+    row.first[0] = int64_t(std::floor(call.step));
+    row.last[0] = row.first[0] + 1;
+    const int64_t layer = shape[2] * shape[3];
+    row.first[1] = (box[0] + common.first[0]) * layer / 8;
+    row.last[1] = ((box[0] + common.last(0)) * layer + 7) / 8;
+    for (; row.first[0] <= int64_t(std::ceil(call.step)); row.first[0]++, row.last[0]++) {
+        Buffer bits;
+        if (!read_region(call.file, *array, row, bits, nullptr, error)) return false;
+        size_t to = 0;
+        for (int64_t k = 0; k < common.count[0]; k++)
+            for (int64_t j = 0; j < common.count[1]; j++) {
+                const int64_t z = box[0] + common.first[0] + (k << common.lod);
+                const int64_t y = box[2] + common.first[1] + (j << common.lod);
+                int64_t bit = z * layer + y * shape[3] + box[4] + common.first[2];
+                bit -= row.first[1] * 8;
+                for (int64_t i = 0; i < common.count[2]; i++, bit += int64_t(1) << common.lod)
+                    if (bits[size_t(bit >> 3)] >> (7 - (bit & 7)) & 1) mask[to++] = 0;
+                    else to++;
+            }
+    }
+    return true;
+}
+
+bool check_finite(const Frame& frame, fhash_error& error) {
+    return with_type(frame.type, [&](auto type) {
+        using T = decltype(type);
+        if constexpr (is_real<T>) {
+            const T* const values = reinterpret_cast<const T*>(frame.values.data());
+            const auto infinite = [](T value) { return std::isinf(real(value)); };
+            if (std::any_of(values, values + frame.values.size() / sizeof(T), infinite))
+                return fail(error, FHASH_ERROR_DAMAGED,
+                            "the table holds infinities; the file is damaged");
+        }
+        return true;
+    });
+}
+
+// The values of one frame, or between two, in a type of floats.
+template <class F>
+void to_floats(const Call& call, const Frame& first, const Frame& second, double weight,
+               bool clipped, std::vector<F>& out) {
+    const F low = F(call.variable.within[0]), high = F(call.variable.within[1]);
+    out.resize(first.mask.size());
+    with_type(first.type, [&](auto type) {
+        using T = decltype(type);
+        const T* const one = reinterpret_cast<const T*>(first.values.data());
+        const T* const two = reinterpret_cast<const T*>(second.values.data());
+        for (size_t i = 0; i < out.size(); i++) {
+            F value;
+            if constexpr (std::is_same<T, Half>::value) value = F(real(one[i]));
+            else value = F(one[i]);
+            if (weight > 0) value = F(real(one[i]) * (1 - weight) + real(two[i]) * weight);
+            if (clipped && value < low) value = low;
+            if (clipped && value > high) value = high;
+            out[i] = first.mask[i] ? value : std::numeric_limits<F>::quiet_NaN();
+        }
+        return true;
+    });
+}
+
+// Rows of the part within the box: where they begin in the result.
+template <class Row> void for_rows(const Call& call, Row row) {
+    const int64_t* const count = call.common.count;
+    for (int64_t k = 0; k < count[0]; k++)
+        for (int64_t j = 0; j < count[1]; j++) {
+            const int64_t to = ((call.at[0] + k) * call.lattice.count[1] + call.at[1] + j) *
+                                   call.lattice.count[2] + call.at[2];
+            row(size_t((k * count[1] + j) * count[2]), size_t(to), size_t(count[2]));
+        }
+}
+
+template <class Out, class F> void put_floats(const Call& call, const std::vector<F>& values) {
+    Out* const out = reinterpret_cast<Out*>(call.values);
+    for_rows(call, [&](size_t from, size_t to, size_t count) {
+        for (size_t i = 0; i < count; i++) out[to + i] = cast<Out>(double(values[from + i]));
+    });
+}
+
+// NaN everywhere.
+void blank_floats(const Call& call) {
+    with_type(call.type, [&](auto type) {
+        using T = decltype(type);
+        if constexpr (is_real<T>)
+            std::fill_n(reinterpret_cast<T*>(call.values), call.lattice.size(), not_a_number<T>());
+        return true;
+    });
+}
+
+template <class F>
+bool give_floats(const Call& call, const Frame& first, const Frame& second, double weight,
+                 bool clipped, fhash_error& error) {
+    if (!may_use(*call.file.context, sizeof(F) * uint64_t(call.common.size()), error)) return false;
+    std::vector<F> values;
+    to_floats<F>(call, first, second, weight, clipped, values);
+    if (call.type == FHASH_FLOAT16) put_floats<Half>(call, values);
+    if (call.type == FHASH_FLOAT32) put_floats<float>(call, values);
+    if (call.type == FHASH_FLOAT64) put_floats<double>(call, values);
+    return true;
+}
+
+// The fill value of the file in a type of integers; false where it has none.
+template <class T> bool find_fill(Json fill, T& found) {
+    if (!fill) return false;
+    using Limits = std::numeric_limits<T>;
+    if (yyjson_is_int(fill) && yyjson_is_uint(fill)) {
+        found = T(yyjson_get_uint(fill));
+        return yyjson_get_uint(fill) <= uint64_t(Limits::max());
+    }
+    if (yyjson_is_int(fill)) {
+        found = T(yyjson_get_sint(fill));
+        return yyjson_get_sint(fill) >= int64_t(Limits::min());
+    }
+    const double value = yyjson_get_num(fill);
+    const double high = sizeof(T) < 8 ? double(Limits::max()) + 1
+                        : Limits::min() == 0 ? 2 * TWO_63 : TWO_63;
+    if (value != std::floor(value) || value < double(Limits::min()) || value >= high) return false;
+    found = T(value);
+    return true;
+}
+
+// The integers of the file, and its fill value at the other vertices of the region. `frame`: null
+// for none within the box.
+bool give_integers(const Call& call, const Frame* frame, fhash_error& error) {
+    return with_type(call.type, [&](auto type) {
+        using T = decltype(type);
+        if constexpr (is_real<T>) {
+            return false;
+        } else {
+            T* const out = reinterpret_cast<T*>(call.values);
+            T fill = 0;
+            const bool whole = frame && call.common.size() == call.lattice.size() &&
+                               std::count(frame->mask.begin(), frame->mask.end(), 0) == 0;
+            if (!whole && !find_fill(call.variable.fill, fill))
+                return fail(error, FHASH_ERROR_ARGUMENT,
+                            "some vertices have no value, and the file has no fill value of its "
+                            "type; read floats");
+            std::fill_n(out, call.lattice.size(), fill);
+            if (!frame) return true;
+            const T* const values = reinterpret_cast<const T*>(frame->values.data());
+            for_rows(call, [&](size_t from, size_t to, size_t count) {
+                for (size_t i = 0; i < count; i++)
+                    if (frame->mask[from + i]) out[to + i] = values[from + i];
+            });
+            return true;
+        }
+    });
+}
+
+// A frame of the profile compact with its mask.
+bool read_compact(const Call& call, int64_t key, Frame& frame, fhash_error& error) {
+    const Variable& variable = call.variable;
+    const bool read =
+        variable.plain
+            ? read_plain(call.file, variable, key, call.common, frame, error)
+            : read_table(call.file, *variable.find("tables/level_1"), key, call.common, frame,
+                         error);
+    return read && check_finite(frame, error);
+}
+
+// Values of the profile paper, float64, with its residual.
+bool read_paper(const Call& call, double key, Frame& frame, fhash_error& error) {
+    const Variable& variable = call.variable;
+    const size_t count = size_t(call.common.size());
+    frame.type = FHASH_FLOAT64;
+    if (!may_use(*call.file.context, 9 * uint64_t(count), error)) return false;
+    frame.mask.assign(count, 0);
+    frame.values.resize(8 * count);
+    double* const values = reinterpret_cast<double*>(frame.values.data());
+    for (int64_t each : {int64_t(std::floor(key)), int64_t(std::ceil(key))})
+        if (!add_occupancy(call.file, variable, each, call.common, frame.mask, error)) return false;
+    if (!read_network(call.file, variable, key, call.common, frame.mask, values, error))
+        return false;
+    if (!variable.residual) return true;
+    const Array* const array = variable.find("residual");
+    const double before = std::floor(call.step), weight = call.step - before;
+    Frame frames[2];
+    for (int i = 0; i < (weight > 0 ? 2 : 1); i++)
+        if (!read_table(call.file, *array, int64_t(before) + i, call.common, frames[i], error) ||
+            !check_finite(frames[i], error))
+            return false;
+    std::vector<double> more;
+    to_floats<double>(call, frames[0], frames[1], weight, false, more);
+    for (size_t i = 0; i < count; i++) values[i] += more[i];
+    return true;
+}
+
+bool read_values(Call& call, fhash_error& error) {
+    const Variable& variable = call.variable;
+    if (!call.integers()) blank_floats(call);
+    if (call.common.count[0] < 1)
+        return !call.integers() || give_integers(call, nullptr, error);
+    double key = 0;
+    if (!find_key(call.file, variable, call.step, key, error)) return false;
+    const double before = std::floor(key);
+    double weight = 0;
+    Frame first, second;
+    if (variable.compact) {
+        weight = key - before;
+        if (!read_compact(call, int64_t(before), first, error)) return false;
+        if (weight > 0) {
+            if (!read_compact(call, int64_t(before) + 1, second, error)) return false;
+            // A value is no better than the two that it lies between.
+            for (size_t i = 0; i < first.mask.size(); i++) first.mask[i] &= second.mask[i];
+        }
+    } else if (!read_paper(call, key, first, error)) {
+        return false;
+    }
+    if (!take_missing(call, first.mask, error)) return false;
+    if (call.integers()) return give_integers(call, &first, error);
+    const bool clipped = key != before || variable.residual;
+    return variable.in_float32() ? give_floats<float>(call, first, second, weight, clipped, error)
+                                 : give_floats<double>(call, first, second, weight, clipped, error);
+}
+
+bool check_type(const Call& call, fhash_error& error) {
+    if (call.type == FHASH_FLOAT32 || call.type == FHASH_FLOAT64) return true;
+    const Variable& variable = call.variable;
+    if (call.type != variable.type || call.step != std::floor(call.step) || call.lattice.lod)
+        return fail(error, FHASH_ERROR_ARGUMENT,
+                    "type is float32, float64, or at a whole step with lod 0 that of the source");
+    const bool held = variable.compact && variable.values == variable.type &&
+                      variable.keys() == variable.shape[0];
+    return held || !call.integers() ||
+           fail(error, FHASH_ERROR_UNSUPPORTED,
+                "the file does not hold the integers of its source; read floats");
+}
+
+}  // namespace
+
+}  // namespace fhash
+
+using namespace fhash;
+
+int32_t fhash_read(fhash_file* file, int32_t number, double step, const int64_t* region,
+                   int32_t lod, int32_t type, void* values, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        if (!file || number < 0 || number >= fhash_variables(file) || !values)
+            return fail(failed, FHASH_ERROR_ARGUMENT,
+                        "a file, a variable of it and room for values are needed");
+        const Variable& variable = file->variables[size_t(number)];
+        if (!(step >= 0 && step <= double(variable.shape[0] - 1)))
+            return fail(failed, FHASH_ERROR_ARGUMENT, "step %g is outside 0 to %lld", step,
+                        (long long)(variable.shape[0] - 1));
+        const int levels = detail_levels(variable);
+        if (lod < 0 || lod > levels)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "lod %d; the variable has 0 to %d", lod,
+                        levels);
+        Call call = {*file, variable, step, type, static_cast<uint8_t*>(values), {}, {}, {}};
+        return set_lattice(call, region, lod, failed) && check_type(call, failed) &&
+               read_values(call, failed);
+    });
+}

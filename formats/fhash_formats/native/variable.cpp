@@ -1,0 +1,487 @@
+#include "variable.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+namespace fhash {
+
+const char* const COORDINATES[4] = {"coords/time", "coords/z", "coords/y", "coords/x"};
+
+namespace {
+
+constexpr int64_t MAX_RULED = 1 << 20;  // positions that a header describes
+constexpr int64_t ULPS_LIMIT = (int64_t(1) << 52) - 1;
+const char* const AXES[4] = {"time", "z", "y", "x"};
+const char* const FEATURES[4] = {"transform", "plain", "sparse-tables", "residual"};
+
+bool is_node(const std::string& name) {
+    const auto fits = [](char letter) {
+        return (letter >= 'A' && letter <= 'Z') || (letter >= 'a' && letter <= 'z') ||
+               (letter >= '0' && letter <= '9') || letter == '_' || letter == '-';
+    };
+    return !name.empty() && name.size() <= 100 && name != "parts" &&
+           std::all_of(name.begin(), name.end(), fits);
+}
+
+// The path of an array of a variable in `parts`.
+std::string part_path(size_t number, const std::string& name) {
+    std::string path = "parts/" + std::to_string(number) + ".";
+    for (const char letter : name) {
+        if (letter == '.') path += "..";
+        else path += letter == '/' ? '.' : letter;
+    }
+    return path;
+}
+
+// The number of the variable and the name of an array in `parts`; false for other paths.
+bool split_part(const std::string& path, size_t count, size_t& number, std::string& name) {
+    const size_t dot = path.find('.');
+    if (dot == std::string::npos || dot < 7 || dot > 16) return false;
+    number = size_t(std::strtoull(path.c_str() + 6, nullptr, 10));
+    name.clear();
+    for (size_t i = dot + 1; i < path.size(); i++) {
+        const bool pair = path[i] == '.' && i + 1 < path.size() && path[i + 1] == '.';
+        name += path[i] == '.' && !pair ? '/' : path[i];
+        i += pair;
+    }
+    return number < count && !name.empty() && part_path(number, name) == path;
+}
+
+bool has_feature(const Record& top, const char* feature) {
+    const Json list = top.find("required_features");
+    yyjson_arr_iter iter = yyjson_arr_iter_with(list);
+    while (Json each = yyjson_arr_iter_next(&iter))
+        if (yyjson_equals_str(each, feature)) return true;
+    return false;
+}
+
+// The least or greatest float64 within the range, from an end that may be a larger integer.
+double inner_end(Json end, bool low) {
+    const double value = yyjson_get_num(end);
+    if (!yyjson_is_int(end) || std::fabs(value) <= 9007199254740992.0) return value;
+    const bool negative = value < 0;
+    const uint64_t exact = negative ? uint64_t(0) - uint64_t(yyjson_get_sint(end))
+                                    : yyjson_get_uint(end);
+    const double size = std::fabs(value);  // rounded from `exact`, at most 2^64
+    const bool beyond = size >= 18446744073709551616.0 || uint64_t(size) > exact;
+    const bool below = !beyond && uint64_t(size) < exact;
+    const bool higher = negative ? below : beyond, lower = negative ? beyond : below;
+    if (low && lower) return std::nextafter(value, HUGE_VAL);
+    if (!low && higher) return std::nextafter(value, -HUGE_VAL);
+    return value;
+}
+
+bool read_values(Variable& variable, fhash_error& error) {
+    const Record& top = variable.header;
+    Record source, domain;
+    std::string type;
+    if (!top.record("variable", source, error) || !source.text("units", variable.units, error) ||
+        !source.text("dtype", type, error))
+        return false;
+    variable.type = type_of_name(type.c_str());
+    if (!source.need(variable.type != 0, "dtype", "a data type", error)) return false;
+    Record attributes;
+    if (!source.record("attributes", attributes, error)) return false;
+    if (!json_text(attributes.values, variable.attributes))
+        return fail(error, FHASH_ERROR_MEMORY, "no memory for attributes");
+    double fill = 0;
+    variable.fill = source.find("fill");
+    if (variable.fill && !source.number("fill", fill, error)) return false;
+    if (!top.record("domain", domain, error) ||
+        !domain.integers("shape", 4, 1, MAX_LENGTH, variable.shape, error) ||
+        !top.numbers("value_range", 2, variable.range, error) ||
+        !top.number("background", variable.background, error))
+        return false;
+    const double most = variable.in_float32() ? 3.4028234663852886e38 : HUGE_VAL;
+    const double* const range = variable.range;
+    if (!top.need(range[0] <= range[1] && std::fabs(range[0]) <= most &&
+                      std::fabs(range[1]) <= most,
+                  "value_range", "two allowed numbers, the lower first", error) ||
+        !top.need(std::fabs(variable.background) <= most, "background", "allowed", error))
+        return false;
+    const Json list = top.find("value_range");
+    for (int i = 0; i < 2; i++)
+        variable.within[i] = inner_end(yyjson_arr_get(list, size_t(i)), i == 0);
+    if (variable.within[0] > variable.within[1])
+        std::copy(range, range + 2, variable.within);
+    Record quality;
+    return top.record("quality", quality, error) &&
+           quality.number_or_null("psnr", variable.psnr, error) &&
+           quality.number_or_null("max_abs_error", variable.max_error, error);
+}
+
+bool read_box(Variable& variable, fhash_error& error) {
+    const Record& top = variable.header;
+    const Json bounds = top.find("feature_bounding_box");
+    bool good = yyjson_is_arr(bounds) && yyjson_arr_size(bounds) == 3;
+    for (size_t a = 0; good && a < 3; a++) {
+        const Json bound = yyjson_arr_get(bounds, a);
+        int64_t* const ends = variable.box + 2 * a;
+        const int64_t length = variable.shape[a + 1];
+        good = yyjson_is_arr(bound) && yyjson_arr_size(bound) == 2 &&
+               is_whole(yyjson_arr_get(bound, 0), 0, length, ends[0]) &&
+               is_whole(yyjson_arr_get(bound, 1), 0, length, ends[1]) && ends[0] < ends[1];
+    }
+    return top.need(good, "feature_bounding_box", "within the domain", error);
+}
+
+bool read_levels(Variable& variable, fhash_error& error) {
+    const Json list = variable.model.find("levels");
+    const size_t count = yyjson_is_arr(list) ? yyjson_arr_size(list) : 0;
+    bool good = count >= 1 && count <= MAX_LEVELS;
+    std::array<int64_t, 4> most = {variable.shape[0], variable.length(0), variable.length(1),
+                                   variable.length(2)};
+    yyjson_arr_iter iter = yyjson_arr_iter_with(good ? list : nullptr);
+    while (Json level = yyjson_arr_iter_next(&iter)) {
+        std::array<int64_t, 4> lengths = {};
+        good = good && yyjson_is_arr(level) && yyjson_arr_size(level) == 4;
+        for (size_t a = 0; good && a < 4; a++)
+            good = is_whole(yyjson_arr_get(level, a), 1, most[a], lengths[a]);
+        variable.levels.push_back(lengths);
+        most = lengths;
+    }
+    for (size_t a = 1; good && a < 4; a++)
+        good = variable.levels[0][a] == variable.length(int(a) - 1);
+    return variable.model.need(good, "levels", "[t, z, y, x] of the box, and coarser ones", error);
+}
+
+// The part of `model` that reading needs.
+bool read_model(Variable& variable, fhash_error& error) {
+    const Record& top = variable.header;
+    Record& model = variable.model;
+    std::string profile;
+    if (!top.record("model", model, error) || !model.text("profile", profile, error) ||
+        !model.text("tables", variable.tables, error))
+        return false;
+    variable.compact = profile == "compact";
+    variable.plain = has_feature(variable.top, "plain");
+    variable.residual = has_feature(variable.top, "residual");
+    if (!variable.compact && profile != "paper")
+        return fail(error, FHASH_ERROR_UNSUPPORTED, "header key model.profile is %s",
+                    shown(profile.c_str()).c_str());
+    const bool coded = variable.tables == "transform";
+    const bool transform = has_feature(variable.top, "transform");
+    const bool sound = variable.compact ? !variable.residual && (variable.plain || transform)
+                                        : !variable.plain && (!coded || transform);
+    if (!variable.top.need(sound, "required_features", "those of its profile", error) ||
+        !read_levels(variable, error))
+        return false;
+    if (!variable.compact) return true;
+    std::string values = variable.tables;
+    if (variable.plain && !model.text("values", values, error)) return false;
+    variable.values = type_of_name(values.c_str());
+    return model.need(variable.values != 0 &&
+                          !(variable.in_float32() && variable.values == FHASH_FLOAT64),
+                      variable.plain ? "values" : "tables", "a type for its source", error) &&
+           model.need(variable.plain || variable.levels.size() == 1, "levels", "one level", error);
+}
+
+bool check_positions(const Record& record, int64_t length, fhash_error& error) {
+    double number = 0;
+    std::string text;
+    if ((record.find("start") && !record.number("start", number, error)) ||
+        (record.find("step") && !record.number("step", number, error)) ||
+        (record.find("name") && !record.text("name", text, error)))
+        return false;
+    const Json dtype = record.find("dtype"), values = record.find("values"),
+               ulps = record.find("ulps"), attributes = record.find("attributes");
+    if (!record.need(!dtype || yyjson_equals_str(dtype, "float32") ||
+                         yyjson_equals_str(dtype, "float64"),
+                     "dtype", "float64 or float32", error) ||
+        !record.need(!attributes || yyjson_is_obj(attributes), "attributes", "an object", error))
+        return false;
+    if (values) {
+        std::vector<double> listed;
+        listed.resize(size_t(length));
+        if (!record.numbers("values", size_t(length), listed.data(), error)) return false;
+    }
+    if (!ulps) return true;
+    const size_t count = yyjson_is_arr(ulps) ? yyjson_arr_size(ulps) : 0;
+    bool good = count >= 1 && int64_t(count) <= length && !values;
+    yyjson_arr_iter iter = yyjson_arr_iter_with(good ? ulps : nullptr);
+    int64_t moves = 0;
+    while (Json each = yyjson_arr_iter_next(&iter))
+        good = good && is_whole(each, -ULPS_LIMIT, ULPS_LIMIT, moves);
+    return record.need(good, "ulps", "whole numbers of a rule", error);
+}
+
+bool check_coordinates(const Variable& variable, fhash_error& error) {
+    Record all;
+    if (!variable.header.find("coordinates")) return true;
+    if (!variable.header.record("coordinates", all, error)) return false;
+    for (int axis = 0; axis < 4; axis++) {
+        Record record;
+        if (!all.find(AXES[axis])) continue;
+        if (!all.record(AXES[axis], record, error) ||
+            !all.need(variable.shape[axis] <= MAX_RULED, AXES[axis], "an array", error) ||
+            !check_positions(record, variable.shape[axis], error))
+            return false;
+    }
+    return true;
+}
+
+bool check_array(const Variable& variable, const char* name, std::initializer_list<int64_t> shape,
+                 std::initializer_list<int32_t> types, bool required, fhash_error& error) {
+    const Array* const array = variable.find(name);
+    if (!array && required) return fail(error, FHASH_ERROR_DAMAGED, "array %s is missing", name);
+    if (!array) return true;
+    const bool fits = size_t(array->axes) == shape.size() &&
+                      std::equal(shape.begin(), shape.end(), array->shape.begin()) &&
+                      std::count(types.begin(), types.end(), array->type);
+    return fits || fail(error, FHASH_ERROR_DAMAGED,
+                        "array %s has not the shape and type that the header asks for", name);
+}
+
+// Checks the arrays that both profiles, and the profile compact, are read from.
+bool check_arrays(const Variable& variable, fhash_error& error) {
+    const auto& level = variable.levels[0];
+    const int64_t* const shape = variable.shape;
+    const Json coordinates = variable.header.find("coordinates");
+    for (int axis = 0; axis < 4; axis++)
+        if (!check_array(variable, COORDINATES[axis], {shape[axis]}, {FHASH_FLOAT64},
+                         !yyjson_obj_get(coordinates, AXES[axis]), error))
+            return false;
+    // The product of three lengths up to 2^40 is beyond int64; an array's shape is not.
+    double vertices = double(shape[1]) * double(shape[2]) * double(shape[3]);
+    const int64_t bytes = vertices < 1e18 ? (shape[1] * shape[2] * shape[3] + 7) / 8 : 0;
+    if (!check_array(variable, "key_frames", {level[0]}, {FHASH_INT64}, level[0] < shape[0],
+                     error) ||
+        !check_array(variable, "missing/bits", {shape[0], bytes}, {FHASH_UINT8}, false, error))
+        return false;
+    if (variable.compact && !variable.plain &&
+        !check_array(variable, "tables/level_1", {level[0], level[1], level[2], level[3]},
+                     {variable.values}, true, error))
+        return false;
+    const bool transform = has_feature(variable.top, "transform");
+    for (const auto& each : variable.arrays) {
+        const bool beside = each.first.rfind("auxiliary/", 0) == 0 && !variable.plain;
+        if (!transform && (each.second->sharded || (each.second->tiles && !beside)))
+            return fail(error, FHASH_ERROR_DAMAGED, "array %s has codecs of the feature transform",
+                        each.first.c_str());
+    }
+    return true;
+}
+
+bool read_header(Variable& variable, fhash_error& error) {
+    const Json features = variable.header.find("features");
+    variable.features = features ? int64_t(yyjson_arr_size(features)) : 1;
+    if (!variable.header.need(!features || (yyjson_is_arr(features) && variable.features),
+                              "features", "a list of texts", error))
+        return false;
+    return read_values(variable, error) && read_box(variable, error) &&
+           read_model(variable, error) && check_coordinates(variable, error);
+}
+
+// Reads the places of the arrays of variables that lie with them.
+struct Places {
+    const Hierarchy& hierarchy;
+    std::vector<Variable>& variables;
+    std::map<std::string, size_t> tables;  // numbers of variables by their table at the root
+    std::vector<std::map<std::string, const Array*>> own;
+
+    bool read_names(size_t number, fhash_error& error) {
+        const Record& header = variables[number].header;
+        std::string table;
+        if (header.find("array") &&
+            (!header.text("array", table, error) ||
+             !header.need(is_node(table) && tables.emplace(table, number).second, "array",
+                          "a name that no other has", error)))
+            return false;
+        const Json list = header.find("dimensions");
+        bool good = yyjson_is_arr(list) && yyjson_arr_size(list) == 4;
+        std::string* const names = variables[number].dimensions;
+        for (size_t a = 0; good && a < 4; a++) {
+            const Json name = yyjson_arr_get(list, a);
+            good = yyjson_is_str(name);
+            if (good) names[a] = yyjson_get_str(name);
+            good = good && is_node(names[a]) && std::count(names, names + a, names[a]) == 0;
+        }
+        return header.need(good, "dimensions", "four different names", error);
+    }
+
+    bool place_own(fhash_error& error) {
+        own.resize(variables.size());
+        for (const auto& each : hierarchy.arrays) {
+            const auto at = tables.find(each.first);
+            if (at != tables.end()) {
+                if (!own[at->second].emplace("tables/level_1", &each.second).second)
+                    return fail(error, FHASH_ERROR_DAMAGED, "array %s is there twice",
+                                each.first.c_str());
+            } else if (each.first.rfind("parts/", 0) == 0) {
+                size_t number = 0;
+                std::string name;
+                if (!split_part(each.first, variables.size(), number, name) ||
+                    name.rfind("coords/", 0) == 0 ||
+                    !own[number].emplace(name, &each.second).second)
+                    return fail(error, FHASH_ERROR_DAMAGED, "array %s belongs to no variable",
+                                each.first.c_str());
+            }
+        }
+        return true;
+    }
+
+    bool share(size_t number, fhash_error& error) {
+        Variable& variable = variables[number];
+        variable.arrays = own[number];
+        Record shares;
+        if (!variable.header.find("shares")) return true;
+        if (!variable.header.record("shares", shares, error)) return false;
+        yyjson_obj_iter iter = yyjson_obj_iter_with(shares.values);
+        while (Json key = yyjson_obj_iter_next(&iter)) {
+            const std::string name = yyjson_get_str(key);
+            const Json place = yyjson_obj_iter_get_val(key);
+            const bool pair = yyjson_is_arr(place) && yyjson_arr_size(place) == 2;
+            std::string other = name;
+            if (pair && yyjson_is_str(yyjson_arr_get(place, 1)))
+                other = yyjson_get_str(yyjson_arr_get(place, 1));
+            const bool beside =
+                name.rfind("auxiliary/", 0) == 0 && other.rfind("auxiliary/", 0) == 0;
+            int64_t from = 0;
+            if (!is_whole(pair ? yyjson_arr_get(place, 0) : place, 0,
+                          int64_t(variables.size()) - 1, from) ||
+                !(beside || (name == other && !pair && name.rfind("coords/", 0) != 0)))
+                return shares.refuse(name.c_str(), "the number of a variable", error);
+            const auto found = own[size_t(from)].find(other);
+            if (found == own[size_t(from)].end() ||
+                !variable.arrays.emplace(name, found->second).second)
+                return fail(error, FHASH_ERROR_DAMAGED, "shared array %s is missing, or is there",
+                            shown(name.c_str()).c_str());
+        }
+        return true;
+    }
+
+    bool add_coordinates(Variable& variable, fhash_error& error) {
+        for (int axis = 0; axis < 4; axis++) {
+            const std::string& node = variable.dimensions[axis];
+            if (tables.count(node))
+                return fail(error, FHASH_ERROR_DAMAGED,
+                            "header key dimensions has a name that a variable has");
+            if (const Array* const array = hierarchy.find(node))
+                variable.arrays[COORDINATES[axis]] = array;
+        }
+        return true;
+    }
+};
+
+// Whole numbers in the order of floats, and back.
+template <class Float, class Whole> Float moved(Float value, int64_t by) {
+    if (by == 0) return value;
+    const auto ordered = [](Float number) {
+        Whole bits;
+        std::memcpy(&bits, &number, sizeof bits);
+        return bits < 0 ? int64_t(std::numeric_limits<Whole>::min()) - int64_t(bits)
+                        : int64_t(bits);
+    };
+    const int64_t end = ordered(Float(HUGE_VAL));
+    // Neither a float nor a move is beyond 2^63 in all, but for numbers that are none.
+    const int64_t there = std::clamp(ordered(value) + by, -end, end);
+    const Whole bits =
+        Whole(there < 0 ? int64_t(std::numeric_limits<Whole>::min()) - there : there);
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+}  // namespace
+
+const Array* Variable::find(const std::string& array) const {
+    const auto found = arrays.find(array);
+    return found == arrays.end() ? nullptr : found->second;
+}
+
+bool check_format(Json header, fhash_error& error) {
+    const Record top = {header, "header key "};
+    std::string format;
+    int64_t version[2];
+    if (!top.text("format", format, error) ||
+        !top.need(format == "fhash", "format", "fhash", error) ||
+        !top.integers("format_version", 2, 0, 10000, version, error))
+        return false;
+    if (version[0] != 2)
+        return fail(error, FHASH_ERROR_UNSUPPORTED,
+                    "the file is of format %d.%d; this library reads format 2.x", int(version[0]),
+                    int(version[1]));
+    const Json list = top.find("required_features");
+    if (!top.need(yyjson_is_arr(list), "required_features", "a list of texts", error)) return false;
+    std::vector<std::string> names;
+    yyjson_arr_iter iter = yyjson_arr_iter_with(list);
+    while (Json each = yyjson_arr_iter_next(&iter)) {
+        const std::string name = yyjson_is_str(each) ? yyjson_get_str(each) : "";
+        if (!top.need(!name.empty() && !std::count(names.begin(), names.end(), name),
+                      "required_features", "a list of texts that stand once", error))
+            return false;
+        if (std::none_of(FEATURES, FEATURES + 4, [&](const char* known) { return name == known; }))
+            return fail(error, FHASH_ERROR_UNSUPPORTED,
+                        "the file needs the feature %s, which this library does not know",
+                        shown(name.c_str()).c_str());
+        names.push_back(name);
+    }
+    return true;
+}
+
+bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error) {
+    const Record top = {yyjson_obj_get(hierarchy.root, "fhash"), "header key "};
+    const Json list = top.find("variables");
+    const size_t count = yyjson_is_arr(list) ? yyjson_arr_size(list) : 0;
+    if (!top.need(count > 0, "variables", "a list of at least one object", error)) return false;
+    found.resize(count);
+    Places places{hierarchy, found, {}, {}};
+    std::set<std::string> names;
+    yyjson_arr_iter iter = yyjson_arr_iter_with(list);
+    for (size_t i = 0; i < count; i++) {
+        Variable& variable = found[i];
+        Record source;
+        variable.top = top;
+        variable.header = {yyjson_arr_iter_next(&iter), top.prefix};
+        if (!top.need(yyjson_is_obj(variable.header.values), "variables", "objects", error) ||
+            !variable.header.record("variable", source, error) ||
+            !source.text("name", variable.name, error) ||
+            (variable.header.find("name") &&
+             !variable.header.text("name", variable.name, error)) ||
+            !top.need(names.insert(variable.name).second, "variables",
+                      "of names that stand once", error) ||
+            !read_header(variable, error) || !places.read_names(i, error))
+            return false;
+    }
+    if (!places.place_own(error)) return false;
+    for (size_t i = 0; i < count; i++)
+        if (!places.share(i, error) || !places.add_coordinates(found[i], error) ||
+            !check_arrays(found[i], error))
+            return count == 1 ? false
+                              : fail_in(error, "variable " + shown(found[i].name.c_str()));
+    return true;
+}
+
+bool header_positions(const Variable& variable, int axis, double* positions, fhash_error& error) {
+    const Json rule = yyjson_obj_get(variable.header.find("coordinates"), AXES[axis]);
+    if (!rule) return fail(error, FHASH_ERROR_DAMAGED, "positions are missing");
+    const int64_t length = variable.shape[axis];
+    const Json values = yyjson_obj_get(rule, "values"), ulps = yyjson_obj_get(rule, "ulps");
+    const Json start = yyjson_obj_get(rule, "start"), step = yyjson_obj_get(rule, "step");
+    const bool narrow = yyjson_equals_str(yyjson_obj_get(rule, "dtype"), "float32");
+    yyjson_arr_iter iter = yyjson_arr_iter_with(values ? values : ulps);
+    const int64_t moves = ulps ? int64_t(yyjson_arr_size(ulps)) : 0;
+    for (int64_t i = 0; i < length; i++) {
+        double value = 0;
+        if (values) {
+            value = yyjson_get_num(yyjson_arr_iter_next(&iter));
+        } else {
+            value = double(i) * (step ? yyjson_get_num(step) : 1);
+            value += start ? yyjson_get_num(start) : 0;
+        }
+        const int64_t by =
+            i >= length - moves ? yyjson_get_sint(yyjson_arr_iter_next(&iter)) : 0;
+        positions[i] = narrow ? double(moved<float, int32_t>(float(value), by))
+                              : moved<double, int64_t>(value, by);
+    }
+    return true;
+}
+
+uint64_t occupancy_bytes(const Variable& variable) {
+    int width = 0;
+    for (int a = 0; a < 3; a++)
+        for (int64_t rest = variable.length(a) - 1; rest > 0; rest >>= 1) width++;
+    return width < 63 ? ((uint64_t(1) << width) + 7) / 8 : 0;
+}
+
+}  // namespace fhash

@@ -1,0 +1,439 @@
+#include "zarr.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+namespace fhash {
+
+namespace {
+
+constexpr int64_t MAX_AXIS = int64_t(1) << 62;
+constexpr uint64_t MAX_CHUNK_BYTES = 1 << 30;     // of a decoded inner chunk
+constexpr uint64_t MAX_TILE = 1 << 27;            // vertices
+constexpr uint64_t MAX_SHARD_CHUNKS = 1 << 20;
+constexpr uint64_t MAX_DOCUMENT = 16 << 20;
+constexpr uint64_t GAP = 64 << 10;                // bytes between documents that are read as well
+constexpr uint64_t MOST = 16 << 20;               // bytes of a read of several documents
+const char* const TYPES[12] = {"",       "int8",   "int16",  "int32",   "int64",   "uint8",
+                               "uint16", "uint32", "uint64", "float16", "float32", "float64"};
+const char* const TILE_AXES[4] = {"t", "z", "y", "x"};
+
+bool is(Json value, const char* text) {
+    return yyjson_is_str(value) && yyjson_get_len(value) == std::strlen(text) &&
+           std::strcmp(yyjson_get_str(value), text) == 0;
+}
+
+bool damaged(fhash_error& error, const char* what) {
+    return fail(error, FHASH_ERROR_DAMAGED, "%s", what);
+}
+bool unsupported(fhash_error& error, const char* what) {
+    return fail(error, FHASH_ERROR_UNSUPPORTED, "%s", what);
+}
+
+// Refuses unknown keys, unless their object says that they need not be understood.
+bool check_keys(Json object, std::initializer_list<const char*> known, fhash_error& error) {
+    yyjson_obj_iter iter = yyjson_obj_iter_with(object);
+    while (Json key = yyjson_obj_iter_next(&iter)) {
+        const auto same = [&](const char* name) { return is(key, name); };
+        if (std::any_of(known.begin(), known.end(), same)) continue;
+        if (yyjson_is_false(yyjson_obj_get(yyjson_obj_iter_get_val(key), "must_understand")))
+            continue;
+        return fail(error, FHASH_ERROR_UNSUPPORTED, "key %s is not known",
+                    shown(yyjson_get_str(key)).c_str());
+    }
+    return true;
+}
+
+// A list of lengths along the axes of an array.
+bool read_lengths(Json list, Lengths& lengths, int& axes, const char* what, fhash_error& error) {
+    const size_t count = yyjson_is_arr(list) ? yyjson_arr_size(list) : 0;
+    bool good = count >= 1 && count <= MAX_AXES;
+    yyjson_arr_iter iter = yyjson_arr_iter_with(good ? list : nullptr);
+    for (size_t i = 0; good && i < count; i++)
+        good = is_whole(yyjson_arr_iter_next(&iter), 1, MAX_AXIS, lengths[i]);
+    axes = int(count);
+    return good || fail(error, FHASH_ERROR_DAMAGED, "%s has no 1 to 8 allowed lengths", what);
+}
+
+// The product of some lengths; 0 where it is beyond `most`.
+uint64_t product_within(const Lengths& lengths, int axes, uint64_t most) {
+    uint64_t product = 1;
+    for (int a = 0; a < axes; a++) {
+        if (uint64_t(lengths[a]) > most / product) return 0;
+        product *= uint64_t(lengths[a]);
+    }
+    return product;
+}
+
+bool from_base64(const char* text, size_t size, std::string& bytes) {
+    static const char LETTERS[] =
+        "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    if (size % 4) return false;
+    for (size_t i = 0; i < size; i += 4) {
+        uint32_t group = 0;
+        int pads = 0;
+        for (size_t k = 0; k < 4; k++) {
+            const char letter = text[i + k];
+            const char* place = letter ? std::strchr(LETTERS, letter) : nullptr;
+            if (letter == '=' && i + 4 == size && k >= 2) pads++;
+            if ((letter != '=' || !pads) && (!place || pads)) return false;
+            group = group << 6 | uint32_t(place ? place - LETTERS : 0);
+        }
+        for (int k = 2; k >= pads; k--) bytes += char(group >> 8 * k);
+    }
+    return true;
+}
+
+// The axes in the configuration of tiles: for each axis of the array that of the tile.
+bool read_places(Json list, Array& array, fhash_error& error) {
+    bool taken[4] = {};
+    bool good = yyjson_is_arr(list) && yyjson_arr_size(list) == size_t(array.axes);
+    yyjson_arr_iter iter = yyjson_arr_iter_with(good ? list : nullptr);
+    array.usual = true;
+    for (int a = 0; good && a < array.axes; a++) {
+        const Json name = yyjson_arr_iter_next(&iter);
+        const auto found = std::find_if(TILE_AXES, TILE_AXES + 4,
+                                        [&](const char* axis) { return is(name, axis); });
+        const int place = int(found - TILE_AXES);
+        array.places[a] = place < 4 ? place : -1;
+        good = place < 4 ? !taken[place] : is(name, "") && array.inner[a] == 1;
+        if (place < 4) taken[place] = true;
+        array.usual = array.usual && place == a + 4 - array.axes;
+    }
+    return good || damaged(error, "codec fhash.transform: its axes are not allowed");
+}
+
+bool read_tiles(Json codecs, Array& array, fhash_error& error) {
+    array.tiles = true;
+    if (!product_within(array.inner, array.axes, MAX_TILE))
+        return damaged(error, "tiles of more than 2^27 vertices");
+    if (yyjson_arr_size(codecs) != 1)
+        return unsupported(error, "no codec may follow fhash.transform");
+    const Json configuration = yyjson_obj_get(yyjson_arr_get_first(codecs), "configuration");
+    const Json axes = yyjson_obj_get(configuration, "axes");
+    const Json settings = yyjson_obj_get(configuration, "settings");
+    if (yyjson_obj_size(configuration) != size_t((axes != nullptr) + (settings != nullptr)))
+        return damaged(error, "codec fhash.transform: its configuration has an unknown key");
+    if (settings && (!yyjson_is_str(settings) ||
+                     !from_base64(yyjson_get_str(settings), yyjson_get_len(settings),
+                                  array.settings) || array.settings.empty()))
+        return damaged(error, "codec fhash.transform: its settings are no base64");
+    if (axes) return read_places(axes, array, error);
+    if (array.axes > 4) return damaged(error, "fhash.transform codes arrays of at most 4 axes");
+    for (int a = 0; a < array.axes; a++) array.places[a] = a + 4 - array.axes;
+    return true;
+}
+
+bool read_plain(Json codecs, const Array& array, fhash_error& error) {
+    const char* const little = R"({"name":"bytes","configuration":{"endian":"little"}})";
+    const Json first = yyjson_arr_get(codecs, 0), zstd = yyjson_arr_get(codecs, 1);
+    const Json settings = yyjson_obj_get(zstd, "configuration");
+    bool good = yyjson_arr_size(codecs) == 3 && is(yyjson_obj_get(zstd, "name"), "zstd") &&
+                yyjson_obj_size(zstd) == 2 && yyjson_obj_size(settings) == 2 &&
+                yyjson_is_int(yyjson_obj_get(settings, "level")) &&
+                yyjson_is_false(yyjson_obj_get(settings, "checksum")) &&
+                json_is(yyjson_arr_get(codecs, 2), R"({"name":"crc32c"})");
+    const bool one = fhash_type_size(array.type) == 1 && json_is(first, R"({"name":"bytes"})");
+    good = good && (one || json_is(first, little));
+    return good || unsupported(error, "codecs other than bytes, zstd, crc32c, fhash.transform");
+}
+
+// The codecs of inner chunks.
+bool read_codecs(Json codecs, Array& array, fhash_error& error) {
+    const size_t size = fhash_type_size(array.type);
+    if (!product_within(array.inner, array.axes, MAX_CHUNK_BYTES / size))
+        return damaged(error, "chunks of more than 2^30 bytes");
+    yyjson_arr_iter iter = yyjson_arr_iter_with(codecs);
+    while (Json codec = yyjson_arr_iter_next(&iter)) {
+        const Json configuration = yyjson_obj_get(codec, "configuration");
+        if (!yyjson_is_str(yyjson_obj_get(codec, "name")) ||
+            (configuration && !yyjson_is_obj(configuration)))
+            return damaged(error, "codecs are not a list of {name, configuration}");
+    }
+    const Json name = yyjson_obj_get(yyjson_arr_get_first(codecs), "name");
+    return is(name, "fhash.transform") ? read_tiles(codecs, array, error)
+                                       : read_plain(codecs, array, error);
+}
+
+bool read_sharding(Json codecs, Array& array, fhash_error& error) {
+    const Json codec = yyjson_arr_get_first(codecs);
+    if (!is(yyjson_obj_get(codec, "name"), "sharding_indexed"))
+        return read_codecs(codecs, array, error);
+    const Json settings = yyjson_obj_get(codec, "configuration");
+    const Json location = yyjson_obj_get(settings, "index_location");
+    const Json chunk = yyjson_obj_get(settings, "chunk_shape");
+    const Json inner = yyjson_obj_get(settings, "codecs");
+    const Json index = yyjson_obj_get(settings, "index_codecs");
+    const size_t known = size_t(!!chunk + !!inner + !!index + !!location);
+    if (yyjson_arr_size(codecs) != 1 || !settings || yyjson_obj_size(settings) != known ||
+        (location && !is(location, "end")) ||
+        !json_is(index, R"([{"name":"bytes","configuration":{"endian":"little"}},)"
+                        R"({"name":"crc32c"}])"))
+        return unsupported(error, "sharding_indexed with settings that are not allowed");
+    if (!yyjson_is_arr(inner)) return damaged(error, "sharding_indexed: codecs is not a list");
+    int axes = 0;
+    if (!read_lengths(chunk, array.inner, axes, "chunk_shape", error)) return false;
+    Lengths counts = {};
+    bool good = axes == array.axes;
+    for (int a = 0; good && a < axes; a++) {
+        good = array.chunk[a] % array.inner[a] == 0;
+        counts[a] = array.per_chunk(a);
+    }
+    if (!good || !product_within(counts, axes, MAX_SHARD_CHUNKS))
+        return damaged(error, "sharding_indexed: shards do not fit to their inner chunks");
+    array.sharded = true;
+    return read_codecs(inner, array, error);
+}
+
+bool check_names(Json names, int axes, fhash_error& error) {
+    if (!names || yyjson_is_null(names)) return true;
+    bool good = yyjson_is_arr(names) && yyjson_arr_size(names) == size_t(axes);
+    yyjson_arr_iter iter = yyjson_arr_iter_with(good ? names : nullptr);
+    while (Json name = yyjson_arr_iter_next(&iter))
+        good = good && (yyjson_is_null(name) || yyjson_is_str(name));
+    return good || damaged(error, "dimension_names is no list of a name for each axis");
+}
+
+// The array that a document describes.
+bool read_array(Json values, Array& array, fhash_error& error) {
+    if (!check_keys(values,
+                    {"zarr_format", "node_type", "shape", "data_type", "chunk_grid",
+                     "chunk_key_encoding", "fill_value", "codecs", "attributes", "dimension_names",
+                     "storage_transformers"},
+                    error))
+        return false;
+    const Json type = yyjson_obj_get(values, "data_type");
+    array.type = yyjson_is_str(type) ? type_of_name(yyjson_get_str(type)) : 0;
+    if (!array.type) return unsupported(error, "data_type is not allowed");
+    int axes = 0;
+    if (!read_lengths(yyjson_obj_get(values, "shape"), array.shape, array.axes, "shape", error))
+        return false;
+    const Json grid = yyjson_obj_get(values, "chunk_grid");
+    const Json configuration = yyjson_obj_get(grid, "configuration");
+    if (!is(yyjson_obj_get(grid, "name"), "regular") || !yyjson_is_obj(configuration))
+        return unsupported(error, "only regular grids of chunks are allowed");
+    if (!read_lengths(yyjson_obj_get(configuration, "chunk_shape"), array.chunk, axes,
+                      "chunk_shape", error))
+        return false;
+    if (axes != array.axes) return damaged(error, "chunks have other axes than their array");
+    const Json encoding = yyjson_obj_get(values, "chunk_key_encoding");
+    if (!json_is(encoding, R"({"name":"default"})") &&
+        !json_is(encoding, R"({"name":"default","configuration":{"separator":"/"}})"))
+        return unsupported(error, "only the default chunk_key_encoding with '/' is allowed");
+    const Json fill = yyjson_obj_get(values, "fill_value");
+    if (!yyjson_is_num(fill) || yyjson_get_num(fill) != 0)
+        return unsupported(error, "only 0 is allowed as fill_value");
+    const Json transformers = yyjson_obj_get(values, "storage_transformers");
+    if (transformers && (!yyjson_is_arr(transformers) || yyjson_arr_size(transformers)))
+        return unsupported(error, "storage_transformers are not allowed");
+    if (!check_names(yyjson_obj_get(values, "dimension_names"), array.axes, error)) return false;
+    const Json codecs = yyjson_obj_get(values, "codecs");
+    if (!yyjson_is_arr(codecs)) return damaged(error, "codecs is not a list");
+    array.attributes = yyjson_obj_get(values, "attributes");
+    array.inner = array.chunk;
+    return read_sharding(codecs, array, error);
+}
+
+// Splits the name of a chunk's member, "path/c/0/1", into the path and the index; false for others.
+bool split_chunk(const std::string& name, std::string& path, std::vector<int64_t>& index) {
+    size_t stop = name.size();
+    index.clear();
+    while (true) {
+        const size_t slash = name.rfind('/', stop - 1);
+        if (slash == std::string::npos || slash == 0) return false;
+        const std::string part = name.substr(slash + 1, stop - slash - 1);
+        if (part == "c" && !index.empty()) {
+            path = name.substr(0, slash);
+            std::reverse(index.begin(), index.end());
+            return true;
+        }
+        if (part.empty() || part.size() > 19 || (part.size() > 1 && part[0] == '0') ||
+            part.find_first_not_of("0123456789") != std::string::npos || index.size() > MAX_AXES)
+            return false;
+        index.push_back(int64_t(std::strtoull(part.c_str(), nullptr, 10) & uint64_t(INT64_MAX)));
+        stop = slash;
+    }
+}
+
+constexpr uint32_t NO_MEMBER = 0xFFFFFFFF;
+
+// Gives an array room for the members of its chunks, of which the file has `count`.
+bool make_room(Array& array, uint64_t count, fhash_error& error) {
+    uint64_t chunks = 1;
+    for (int a = 0; a < array.axes && chunks; a++) {
+        const uint64_t along = uint64_t(array.count(array.chunk, a));
+        chunks = along > count / chunks ? 0 : chunks * along;
+    }
+    if (chunks != count || !count)
+        return fail(error, FHASH_ERROR_DAMAGED,
+                    "array %s has %llu chunks; another number is declared", array.path.c_str(),
+                    (unsigned long long)count);
+    array.members.assign(size_t(count), NO_MEMBER);
+    return true;
+}
+
+bool place_member(Array& array, const std::vector<int64_t>& index, uint32_t number) {
+    if (index.size() != size_t(array.axes)) return false;
+    uint64_t place = 0;
+    for (int a = 0; a < array.axes; a++) {
+        const int64_t along = array.count(array.chunk, a);
+        if (index[size_t(a)] >= along) return false;
+        place = place * uint64_t(along) + uint64_t(index[size_t(a)]);
+    }
+    array.members[size_t(place)] = number;  // names are unique, so no place is taken twice
+    return true;
+}
+
+bool place_chunks(const Directory& directory, Hierarchy& found, fhash_error& error) {
+    std::map<std::string, uint64_t> counts;
+    std::string path;
+    std::vector<int64_t> index;
+    const auto is_chunk = [&](const Member& member) {
+        return split_chunk(member.name, path, index) && found.arrays.count(path);
+    };
+    for (const Member& member : directory.members)
+        if (is_chunk(member)) counts[path]++;
+    for (auto& each : found.arrays)
+        if (!make_room(each.second, counts[each.first], error)) return false;
+    for (uint32_t number = 0; number < directory.members.size(); number++) {
+        const Member& member = directory.members[number];
+        const size_t slash = member.name.rfind('/');
+        if (member.name.substr(slash == std::string::npos ? 0 : slash + 1) == "zarr.json") continue;
+        if (!is_chunk(member) || !place_member(found.arrays[path], index, number))
+            return fail(error, FHASH_ERROR_DAMAGED, "member %s belongs to no array",
+                        member.name.c_str());
+    }
+    return true;
+}
+
+// Reads the documents of all nodes, those that lie together at once.
+struct Documents {
+    const Source& source;
+    const Directory& directory;
+    std::map<std::string, Json> nodes;  // by path
+    std::vector<JsonDocument>& kept;
+
+    bool add(const Member& member, const uint8_t* stored, fhash_error& error) {
+        Buffer text;
+        if (!open_member(member, stored, text, error)) return false;
+        JsonDocument document;
+        if (!parse_json(text.data(), text.size(), *source.context, document, error))
+            return fail_in(error, "member " + member.name);
+        const Json values = yyjson_doc_get_root(document.get());
+        const Json type = yyjson_obj_get(values, "node_type");
+        int64_t three = 0;
+        bool good = is_whole(yyjson_obj_get(values, "zarr_format"), 3, 3, three) &&
+                    (is(type, "array") || is(type, "group"));
+        if (!good) unsupported(error, "not the metadata of a Zarr v3 array or group");
+        if (good && is(type, "group"))
+            good = check_keys(values, {"zarr_format", "node_type", "attributes"}, error);
+        const Json attributes = yyjson_obj_get(values, "attributes");
+        if (good && attributes && !yyjson_is_obj(attributes))
+            good = damaged(error, "attributes is not an object");
+        if (!good) return fail_in(error, "member " + member.name);
+        const size_t slash = member.name.rfind('/');
+        nodes[slash == std::string::npos ? "" : member.name.substr(0, slash)] = values;
+        kept.push_back(std::move(document));
+        return true;
+    }
+
+    bool read_span(const std::vector<const Member*>& together, fhash_error& error) {
+        const uint64_t start = together.front()->offset;
+        Buffer bytes;
+        if (!source.read(start, together.back()->end() - start, bytes, error)) return false;
+        for (const Member* member : together)
+            if (!add(*member, bytes.data() + (member->offset - start), error)) return false;
+        return true;
+    }
+
+    bool read(fhash_error& error) {
+        std::vector<const Member*> together;
+        uint64_t total = 0;
+        for (const Member& member : directory.members) {
+            const size_t slash = member.name.rfind('/');
+            const size_t start = slash == std::string::npos ? 0 : slash + 1;
+            if (member.name.compare(start, std::string::npos, "zarr.json")) continue;
+            total += member.full_size < 0 ? member.size : uint64_t(member.full_size);
+            if (member.size > MAX_DOCUMENT || !may_use(*source.context, total, error))
+                return member.size > MAX_DOCUMENT ? damaged(error, "metadata of over 2^24 bytes")
+                                                  : false;
+            if (!together.empty() && (member.offset - together.back()->end() > GAP ||
+                                      member.end() - together.front()->offset > MOST)) {
+                if (!read_span(together, error)) return false;
+                together.clear();
+            }
+            together.push_back(&member);
+        }
+        return together.empty() || read_span(together, error);
+    }
+};
+
+// Refuses a root that repeats other documents than the file has.
+bool check_consolidated(const std::map<std::string, Json>& nodes, fhash_error& error) {
+    const Json repeated = yyjson_obj_get(nodes.at(""), "consolidated_metadata");
+    if (!repeated || yyjson_is_null(repeated)) return true;
+    const Json metadata = yyjson_obj_get(repeated, "metadata");
+    bool good = yyjson_obj_size(repeated) == 3 &&
+                is(yyjson_obj_get(repeated, "kind"), "inline") &&
+                yyjson_is_false(yyjson_obj_get(repeated, "must_understand")) &&
+                yyjson_is_obj(metadata) && yyjson_obj_size(metadata) == nodes.size() - 1;
+    yyjson_obj_iter iter = yyjson_obj_iter_with(good ? metadata : nullptr);
+    while (Json key = yyjson_obj_iter_next(&iter)) {
+        const auto own = nodes.find(yyjson_get_str(key));
+        good = good && own != nodes.end() && !own->first.empty() &&
+               yyjson_equals(own->second, yyjson_obj_iter_get_val(key));
+    }
+    return good || damaged(error, "member zarr.json: consolidated_metadata has other documents");
+}
+
+}  // namespace
+
+int32_t type_of_name(const char* name) {
+    for (int32_t type = 1; type < 12; type++)
+        if (std::strcmp(TYPES[type], name) == 0) return type;
+    return 0;
+}
+
+const char* type_name(int32_t type) { return TYPES[type]; }
+
+const Array* Hierarchy::find(const std::string& path) const {
+    const auto found = arrays.find(path);
+    return found == arrays.end() ? nullptr : &found->second;
+}
+
+bool read_hierarchy(const Source& source, const Directory& directory, Hierarchy& found,
+                    fhash_error& error) {
+    Documents documents{source, directory, {}, found.documents};
+    if (!documents.read(error)) return false;
+    const auto root = documents.nodes.find("");
+    if (root == documents.nodes.end()) return damaged(error, "member zarr.json is missing");
+    const auto is_group = [&](const std::string& path) {
+        const auto node = documents.nodes.find(path);
+        return node != documents.nodes.end() &&
+               is(yyjson_obj_get(node->second, "node_type"), "group");
+    };
+    found.root = yyjson_obj_get(root->second, "attributes");
+    if (!is_group("") || !yyjson_is_obj(yyjson_obj_get(found.root, "fhash")))
+        return damaged(error, "member zarr.json is not the group of an fhash container");
+    if (!check_format(yyjson_obj_get(found.root, "fhash"), error)) return false;
+    for (const auto& node : documents.nodes) {
+        const size_t slash = node.first.rfind('/');
+        const std::string parent = slash == std::string::npos ? "" : node.first.substr(0, slash);
+        if (!node.first.empty() && !is_group(parent))
+            return fail(error, FHASH_ERROR_DAMAGED, "member %s/zarr.json lies in no group",
+                        node.first.c_str());
+    }
+    if (!check_consolidated(documents.nodes, error)) return false;
+    for (const auto& node : documents.nodes) {
+        if (is_group(node.first)) continue;
+        Array& array = found.arrays[node.first];
+        array.path = node.first;
+        array.number = uint32_t(found.arrays.size());
+        if (!read_array(node.second, array, error))
+            return fail_in(error, "member " + node.first + "/zarr.json");
+    }
+    return place_chunks(directory, found, error);
+}
+
+}  // namespace fhash
