@@ -5,8 +5,7 @@ when the package is installed, and without it nothing works. tests/reference dec
 in numpy.
 
 `PROTOTYPES` lists the exported functions that this package calls, with the types of their
-arguments. Every exported function returns an int64: at least 0 for success, below 0 for an error
-(core.hpp).
+arguments. Every kernel returns an int64: at least 0 for success, below 0 for an error (core.hpp).
 """
 
 from __future__ import annotations
@@ -67,7 +66,17 @@ _MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
 _TYPES = ("f32", "f64")
 _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
+_TILE = (ARRAY, ARRAY)
+"""Context and tile."""
+_STREAM = (*_TILE, ARRAY, ctypes.c_size_t)
+
 PROTOTYPES: Prototypes = {
+    # fhash.h and part.cpp
+    "fhash_context_create": (ctypes.c_uint64, ctypes.c_int32),
+    "fhash_tile_decode": (*_STREAM, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
+    "fhash_tile_table": (*_STREAM, ctypes.c_int32, *(ARRAY,) * 4),
+    "fhash_tile_uncorrected": (*_STREAM, *(ARRAY,) * 4),
+    "fhash_tile_part": (*_TILE, *(ARRAY,) * 4),
     # coder.cpp
     "fhash_encode": (
         ARRAY,
@@ -204,4 +213,6 @@ def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: 
 def _declare(loaded: ctypes.CDLL, name: str, arguments: tuple[Any, ...]) -> None:
     function = getattr(loaded, name)
     function.argtypes = arguments
-    function.restype = ctypes.c_int64
+    # Those of fhash.h have other results than the kernels.
+    tile = ctypes.c_int32 if name.startswith("fhash_tile_") else ctypes.c_int64
+    function.restype = ctypes.c_void_p if name == "fhash_context_create" else tile

@@ -352,8 +352,8 @@ bool is_shape(const int64_t* shape) {
 bool apply_head(const fhash_context& context, const Head& head, const float* in, const Shape& shape,
                 float* out, fhash_error& error) {
     const int64_t rows = shape[1] * shape[2];
-    // Fewer rows are done before a thread begins.
-    constexpr int64_t LEAST = 1 << 14;
+    // Values of a part; with fewer a further thread does not pay.
+    constexpr int64_t LEAST = 1 << 19;
     const int64_t parts = std::clamp<int64_t>(
         std::min<int64_t>(context.threads, vertices(shape) / LEAST), 1, rows);
     std::vector<int64_t> codes((size_t)parts, 0);
@@ -434,10 +434,13 @@ bool make_job(Job& job, const fhash_tile* tile, const void* stream, size_t size,
         const size_t length = own.at ? own.left() : tile->settings_size;
         job.settings = unpack_settings(job.context, packed, length, error);
         if (!job.settings) return false;
-        if (!job.settings->origin.zero() && !has_origin(job.settings->origin, job.type))
+        const Wide& origin = job.settings->origin;
+        if (!origin.zero() && !has_origin(origin, job.type))
             return fail(error, FHASH_ERROR_DAMAGED,
                         "the settings of a coded tile do not fit: an array of its type has no "
-                        "values about their origin");
+                        "values about the origin %s%llu",
+                        origin.negative ? "-" : "",
+                        (unsigned long long)(origin.negative ? 0 - origin.bits : origin.bits));
     }
     return true;
 }

@@ -7,7 +7,7 @@ import struct
 import sys
 import zlib
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -143,6 +143,11 @@ class TileSettings:
             raise InputError(f"an array of {dtype} has no values about the origin {self.origin}")
         return np.dtype(np.int64)
 
+    @cached_property
+    def packed(self) -> bytes:
+        """The packed block; packing a head takes as long as decoding a small tile."""
+        return self.to_bytes()
+
     def to_bytes(self) -> bytes:
         """The packed block. Raises InputError for ends about an origin that are no int64."""
         whole = self.origin != 0 or any(
@@ -194,7 +199,7 @@ class TileSettings:
 
     def to_text(self) -> str:
         """The packed block in base64, as JSON documents have it."""
-        return base64.b64encode(self.to_bytes()).decode("ascii")
+        return base64.b64encode(self.packed).decode("ascii")
 
     @classmethod
     def from_text(cls, text: Any) -> TileSettings:
