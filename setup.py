@@ -69,7 +69,6 @@ WASM = Path("fhash_codec/views/page/fhash.wasm")
 WASM_FLAGS = [
     "--target=wasm32-wasi",
     "-msimd128",
-    "-O2",
     "-ffp-contract=off",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -79,7 +78,11 @@ WASM_FLAGS = [
     "-fdata-sections",
     "-g0",
 ]
-WASM_CPP_FLAGS = ["-std=c++17", "-fno-exceptions", "-fno-rtti"]
+WASM_KERNELS = {"coder", "fast", "head", "lifting", "predict"}
+"""Sources that most of the time is spent in; all others are compiled for size."""
+WASM_SMALL = [("HUF_FORCE_DECOMPRESS_X1", "1"), ("ZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT", "1")]
+"""Definitions by which zstd has one decoder instead of two that are faster on other data."""
+WASM_CPP_FLAGS = ["-fno-threadsafe-statics", "-std=c++17", "-fno-exceptions", "-fno-rtti"]
 WASM_LINK_FLAGS = ["-mexec-model=reactor", "-Wl,-s,--gc-sections,--stack-first,-z,stack-size=1048576"]
 WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
 """Functions that a page has no use for: there are no paths, and nothing is encoded."""
@@ -180,7 +183,8 @@ class BuildWasm(Command):
             result = build / f"{source.name}.o"
             if result.exists() and result.stat().st_mtime > max(source.stat().st_mtime, headers):
                 return result
-            kind = [f"-D{name}={value}" for name, value in THIRD_PARTY]
+            kind = [f"-D{name}={value}" for name, value in [*THIRD_PARTY, *WASM_SMALL]]
+            kind += ["-Os" if source.stem in WASM_KERNELS else "-Oz"]
             kind += [] if source.suffix == ".c" else WASM_CPP_FLAGS
             clang = "clang-14" if source.suffix == ".c" else "clang++-14"
             self._run(clang, *WASM_FLAGS, *kind, f"-I{FORMATS}", "-c", source, "-o", result)
@@ -190,8 +194,6 @@ class BuildWasm(Command):
             objects = list(pool.map(compiled, sources))
         declared = re.findall(r"FHASH_API [^;(]*?(fhash_\w+)\(", (FORMATS / "fhash.h").read_text("utf-8"))
         names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
-        text = "".join(s.read_text("utf-8") for s in sources)
-        names = [n for n in names if n != "fhash_open" and n != "fhash_open_page" and f"{n}(" in text or n in ("malloc","free")]  # TEMP
         exports = [f"-Wl,--export={name}" for name in names]
         self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
         read = sorted({*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")})
