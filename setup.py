@@ -74,16 +74,22 @@ WASM_FLAGS = [
     "-fno-trapping-math",
     "-fvisibility=hidden",
     "-Wno-macro-redefined",
-    "-ffunction-sections",
-    "-fdata-sections",
+    "-flto",
     "-g0",
 ]
 WASM_KERNELS = {"coder", "fast", "head", "lifting", "predict"}
 """Sources that most of the time is spent in; all others are compiled for size."""
-WASM_SMALL = [("HUF_FORCE_DECOMPRESS_X1", "1"), ("ZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT", "1")]
-"""Definitions by which zstd has one decoder instead of two that are faster on other data."""
+WASM_SMALL = [
+    ("HUF_FORCE_DECOMPRESS_X1", "1"),
+    ("ZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT", "1"),
+    ("YYJSON_DISABLE_NON_STANDARD", "1"),
+    ("YYJSON_DISABLE_UTILS", "1"),
+    ("YYJSON_DISABLE_FAST_FP_CONV", "1"),
+    ("yyjson_inline", "inline"),
+]
+"""Definitions by which third_party has one way of each thing instead of several."""
 WASM_CPP_FLAGS = ["-fno-threadsafe-statics", "-std=c++17", "-fno-exceptions", "-fno-rtti"]
-WASM_LINK_FLAGS = ["-mexec-model=reactor", "-Wl,-s,--gc-sections,--stack-first,-z,stack-size=1048576"]
+WASM_LINK_FLAGS = ["-mexec-model=reactor", "-Wl,-s,--gc-sections,--stack-first,--lto-O2,-z,stack-size=1048576"]
 WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
 """Functions that a page has no use for: there are no paths, and nothing is encoded."""
 
@@ -184,7 +190,7 @@ class BuildWasm(Command):
             if result.exists() and result.stat().st_mtime > max(source.stat().st_mtime, headers):
                 return result
             kind = [f"-D{name}={value}" for name, value in [*THIRD_PARTY, *WASM_SMALL]]
-            kind += ["-Os" if source.stem in WASM_KERNELS else "-Oz"]
+            kind += ["-Os"] if source.stem in WASM_KERNELS else ["-Oz", "-DFHASH_SMALL"]
             kind += [] if source.suffix == ".c" else WASM_CPP_FLAGS
             clang = "clang-14" if source.suffix == ".c" else "clang++-14"
             self._run(clang, *WASM_FLAGS, *kind, f"-I{FORMATS}", "-c", source, "-o", result)
@@ -196,6 +202,7 @@ class BuildWasm(Command):
         names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
         exports = [f"-Wl,--export={name}" for name in names]
         self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
+        self._run("wasm-opt", "-Os", "--enable-simd", "--strip-producers", WASM, "-o", WASM)
         read = sorted({*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")})
         digests = {
             path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in [*read, WASM]
