@@ -38,9 +38,14 @@ struct Cache {
 struct Region {
     Lengths first = {}, last = {}, step = {1, 1, 1, 1, 1, 1, 1, 1};
 
+    // Values of it, at most 2^60, which no memory holds.
     uint64_t size(int axes) const {
+        constexpr uint64_t most = uint64_t(1) << 60;
         uint64_t product = 1;
-        for (int a = 0; a < axes; a++) product *= uint64_t(last[a] - first[a]);
+        for (int a = 0; a < axes; a++) {
+            const uint64_t length = uint64_t(last[a] - first[a]);
+            product = length && product > most / length ? most : product * length;
+        }
         return product;
     }
 };

@@ -29,6 +29,7 @@ namespace fhash {
 
 // Whether a call may use so many bytes; fails otherwise.
 inline bool may_use(const fhash_context& context, uint64_t bytes, fhash_error& error) {
+    if (bytes > SIZE_MAX / 2) return fail(error, FHASH_ERROR_MEMORY, "no memory");
     if (context.memory == 0 || bytes <= context.memory) return true;
     return fail(error, FHASH_ERROR_MEMORY, "%llu bytes are needed, and %llu are allowed",
                 (unsigned long long)bytes, (unsigned long long)context.memory);

@@ -1,4 +1,5 @@
 // fhash_read: values of a region at a step, or between two steps.
+#define FHASH_BUILDING
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -55,7 +56,9 @@ bool set_lattice(Call& call, const int64_t* region, int lod, fhash_error& error)
     }
     for (int a = 0; a < 3; a++)
         if (call.common.count[a] < 1) call.common.count[0] = 0;
-    return true;
+    Region all;
+    std::copy(call.lattice.count, call.lattice.count + 3, all.last.begin());
+    return all.size(3) <= SIZE_MAX / 16 || fail(error, FHASH_ERROR_MEMORY, "no memory");
 }
 
 // Takes out of a mask the vertices that had no finite value at a step or one beside it.

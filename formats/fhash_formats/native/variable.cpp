@@ -221,18 +221,6 @@ bool check_coordinates(const Variable& variable, fhash_error& error) {
     return true;
 }
 
-bool check_array(const Variable& variable, const char* name, std::initializer_list<int64_t> shape,
-                 std::initializer_list<int32_t> types, bool required, fhash_error& error) {
-    const Array* const array = variable.find(name);
-    if (!array && required) return fail(error, FHASH_ERROR_DAMAGED, "array %s is missing", name);
-    if (!array) return true;
-    const bool fits = size_t(array->axes) == shape.size() &&
-                      std::equal(shape.begin(), shape.end(), array->shape.begin()) &&
-                      std::count(types.begin(), types.end(), array->type);
-    return fits || fail(error, FHASH_ERROR_DAMAGED,
-                        "array %s has not the shape and type that the header asks for", name);
-}
-
 // Checks the arrays that both profiles, and the profile compact, are read from.
 bool check_arrays(const Variable& variable, fhash_error& error) {
     const auto& level = variable.levels[0];
@@ -249,10 +237,22 @@ bool check_arrays(const Variable& variable, fhash_error& error) {
                      error) ||
         !check_array(variable, "missing/bits", {shape[0], bytes}, {FHASH_UINT8}, false, error))
         return false;
-    if (variable.compact && !variable.plain &&
-        !check_array(variable, "tables/level_1", {level[0], level[1], level[2], level[3]},
-                     {variable.values}, true, error))
-        return false;
+    const std::vector<int64_t> lengths(level.begin(), level.end());
+    if (variable.compact && !variable.plain) {
+        if (!check_array(variable, "tables/level_1", lengths, {variable.values}, true, error))
+            return false;
+    } else {
+        const int64_t features = variable.compact ? 1 : variable.features;
+        const std::vector<int64_t> bits = {features, level[0], occupancy_bytes(variable)};
+        const bool masked = !variable.compact && variable.find("occupancy/mask");
+        if (!(masked ? check_array(variable, "occupancy/mask", lengths, {FHASH_UINT8}, true, error)
+                     : check_array(variable, "occupancy/bits", bits, {FHASH_UINT8}, true, error)) ||
+            !(variable.compact ? check_plain(variable, error) : check_network(variable, error)))
+            return false;
+        if (masked && (variable.find("occupancy/bits") || features > 8 ||
+                       variable.model.find("sparse")))
+            return fail(error, FHASH_ERROR_DAMAGED, "array occupancy/mask may not be there");
+    }
     const bool transform = has_feature(variable.top, "transform");
     for (const auto& each : variable.arrays) {
         const bool beside = each.first.rfind("auxiliary/", 0) == 0 && !variable.plain;
@@ -389,6 +389,18 @@ const Array* Variable::find(const std::string& array) const {
     return found == arrays.end() ? nullptr : found->second;
 }
 
+bool check_array(const Variable& variable, const char* name, const std::vector<int64_t>& shape,
+                 std::initializer_list<int32_t> types, bool required, fhash_error& error) {
+    const Array* const array = variable.find(name);
+    if (!array && required) return fail(error, FHASH_ERROR_DAMAGED, "array %s is missing", name);
+    if (!array) return true;
+    const bool fits = size_t(array->axes) == shape.size() &&
+                      std::equal(shape.begin(), shape.end(), array->shape.begin()) &&
+                      std::count(types.begin(), types.end(), array->type);
+    return fits || fail(error, FHASH_ERROR_DAMAGED,
+                        "array %s has not the shape and type that the header asks for", name);
+}
+
 bool check_format(Json header, fhash_error& error) {
     const Record top = {header, "header key "};
     std::string format;
@@ -477,11 +489,11 @@ bool header_positions(const Variable& variable, int axis, double* positions, fha
     return true;
 }
 
-uint64_t occupancy_bytes(const Variable& variable) {
+int64_t occupancy_bytes(const Variable& variable) {
     int width = 0;
     for (int a = 0; a < 3; a++)
         for (int64_t rest = variable.length(a) - 1; rest > 0; rest >>= 1) width++;
-    return width < 63 ? ((uint64_t(1) << width) + 7) / 8 : 0;
+    return width < 62 ? ((int64_t(1) << width) + 7) / 8 : 0;
 }
 
 }  // namespace fhash

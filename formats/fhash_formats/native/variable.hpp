@@ -40,7 +40,13 @@ bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fh
 // Positions along an axis that stand in the header.
 bool header_positions(const Variable& variable, int axis, double* positions, fhash_error& error);
 
-// Bytes of the occupancy of a key frame, and the bit of a vertex of the box in it.
-uint64_t occupancy_bytes(const Variable& variable);
+// Bytes of the occupancy of a key frame; 0 beyond 2^59.
+int64_t occupancy_bytes(const Variable& variable);
+
+bool check_array(const Variable& variable, const char* name, const std::vector<int64_t>& shape,
+                 std::initializer_list<int32_t> types, bool required, fhash_error& error);
+// Check the arrays of a plain file (plain.cpp), and of the profile paper (paper.cpp).
+bool check_plain(const Variable& variable, fhash_error& error);
+bool check_network(const Variable& variable, fhash_error& error);
 
 }  // namespace fhash
