@@ -26,8 +26,8 @@ export const app = {
 };
 
 const files = JSON.parse(element("files").textContent);
-const compiled = { bytes: null };
-const wasm = () => (compiled.bytes ??= app.wasm ? Promise.resolve(app.wasm) : fetch(new URL("fhash.wasm", import.meta.url)).then((answer) => answer.arrayBuffer()));
+let compiled = null;
+const wasm = () => (compiled ??= (async () => WebAssembly.compile(app.wasm ?? (await (await fetch(new URL("fhash.wasm", import.meta.url))).arrayBuffer())))());
 
 export const variable = () => app.container.variables[app.number];
 export const effects = () => (app.scene.effects ??= {});
@@ -50,7 +50,7 @@ export function background() {
   return document.documentElement.classList.contains("dark") ? "#14171c" : "#ffffff";
 }
 
-/** Open a container: `{url}`, `{blob}` or `{bytes}`, with a name; `state` is what a link said. */
+/** Open a container: `{url}` or `{blob}`, with a name; `state` is what a link said. */
 export async function open(source, name, state = {}) {
   app.container?.close();
   Object.assign(app, { container: null, frame: null, tf: null, counts: null, playing: false, step: 0, number: 0, scene: {}, name });
@@ -470,8 +470,9 @@ function start() {
   const number = Math.max(files.findIndex((one) => one.name === state.file), 0);
   addEventListener("message", ({ data, source }) => {
     if (source !== parent || !data?.fhash) return;
-    app.wasm = data.fhash.wasm;
-    open({ bytes: data.fhash.bytes, script: data.fhash.script }, data.fhash.name, data.fhash.state);
+    const { name, bytes: given, wasm: code, priors, script } = data.fhash;
+    app.wasm = code;
+    open({ blob: new Blob([given]), priors, script }, name);
   });
   if (url) openUrl(url, state);
   else if (state.file?.includes("/")) openUrl(state.file, state);

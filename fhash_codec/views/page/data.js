@@ -3,7 +3,7 @@
 const MEMORY = Math.min((navigator.deviceMemory ?? 4) * 128, 1024) * 2 ** 20;
 const MAX_WORKERS = Math.max(1, Math.min((navigator.hardwareConcurrency ?? 2) - 1, 4));
 
-/** A container of a URL, a file or bytes: `{url}`, `{blob}` or `{bytes}`. */
+/** A container of a URL or a file: `{url}` or `{blob}`; priors and script where the page has no address. */
 export class Container {
   constructor(source, { wasm, changed }) {
     this.source = source;

@@ -1,24 +1,40 @@
-// Decodes a container by fhash.wasm (fhash.h). It reads synchronously: of a URL by ranges, of a file, or of bytes.
+// Decodes a container by fhash.wasm (fhash.h). It reads synchronously: of a URL by ranges, or of a file.
 
 const BLOCK = 1 << 16;
 const KEPT = 1024;
 const SIDE = 8;
 const FLOAT32 = 10;
-const NUMBERS = [, Int8Array, Int16Array, Int32Array, BigInt64Array, Uint8Array, Uint16Array, Uint32Array, BigUint64Array];
+const PRIORS = ["prior.bin", "mask_prior.bin", "fast_prior.bin"];
 
 let source = null;
 let library = null;
 let file = 0;
 let reason = "";
+let priors = [];
+
+/** Answer of a URL, by a request that waits. */
+function asked(method, url, range) {
+  const request = new XMLHttpRequest();
+  request.open(method, url, false);
+  request.responseType = "arraybuffer";
+  if (range) request.setRequestHeader("Range", range);
+  try {
+    request.send();
+  } catch {
+    throw new Error("cannot be reached, or its server does not allow pages of other sites to read it (CORS)");
+  }
+  if (request.status !== 206 && request.status !== 200) throw new Error(`the server answers ${request.status} ${request.statusText}`);
+  return request;
+}
 
 /** Bytes of a container in blocks, which are kept, those used last the longest. */
 class Source {
-  constructor({ url, blob, bytes, blocks, size }) {
+  constructor({ url, blob, blocks, size }) {
     this.url = url;
     this.blob = blob;
-    this.bytes = bytes && new Uint8Array(bytes);
+    this.bytes = null;
     this.blocks = new Map(blocks ?? []);
-    this.size = size ?? this.blob?.size ?? this.bytes?.length;
+    this.size = size ?? this.blob?.size;
     this.end = -1;
     this.ahead = 1;
     if (this.size === undefined) this.measure();
@@ -26,21 +42,18 @@ class Source {
 
   /** Ask for the end of the file, which says its size, too. */
   measure() {
-    const asked = this.ask(`bytes=-${BLOCK}`);
-    const range = asked.getResponseHeader("Content-Range")?.match(/(\d+)-(\d+)\/(\d+)/);
-    let data = new Uint8Array(asked.response);
-    if (asked.status === 200) {
+    const tail = this.ask(`bytes=-${BLOCK}`);
+    const range = tail.getResponseHeader("Content-Range")?.match(/(\d+)-(\d+)\/(\d+)/);
+    let data = new Uint8Array(tail.response);
+    if (tail.status === 200) {
       this.bytes = data;
       this.size = data.length;
       return;
     }
     if (range) this.size = Number(range[3]);
     else {
-      const head = new XMLHttpRequest();
-      head.open("HEAD", this.url, false);
-      head.send();
-      this.size = Number(head.getResponseHeader("Content-Length"));
-      if (!(head.status === 200 && this.size > 0)) throw new Error("the server does not say how large the file is");
+      this.size = Number(asked("HEAD", this.url).getResponseHeader("Content-Length"));
+      if (!(this.size > 0)) throw new Error("the server does not say how large the file is");
     }
     const first = this.size - data.length, cut = (BLOCK - (first % BLOCK)) % BLOCK;
     if (cut && first) data = data.subarray(cut);
@@ -48,16 +61,7 @@ class Source {
   }
 
   ask(range) {
-    const request = new XMLHttpRequest();
-    request.open("GET", this.url, false);
-    request.responseType = "arraybuffer";
-    request.setRequestHeader("Range", range);
-    try {
-      request.send();
-    } catch {
-      throw new Error("cannot be reached, or its server does not allow pages of other sites to read it (CORS)");
-    }
-    if (request.status !== 206 && request.status !== 200) throw new Error(`the server answers ${request.status} ${request.statusText}`);
+    const request = asked("GET", this.url, range);
     postMessage({ loaded: request.response.byteLength, requests: 1 });
     return request;
   }
@@ -72,6 +76,7 @@ class Source {
       let stop = n + 1;
       while (stop <= last && !this.blocks.has(stop)) stop++;
       this.load(n, stop);
+      if (this.bytes) return this.read(offset, length, to);
     }
     for (let n = first; n <= last; n++) {
       const block = this.blocks.get(n), from = Math.max(offset - n * BLOCK, 0);
@@ -97,9 +102,12 @@ class Source {
       data = new Uint8Array(new FileReaderSync().readAsArrayBuffer(this.blob.slice(from, end)));
       postMessage({ loaded: data.length, requests: 0 });
     } else {
-      const asked = this.ask(`bytes=${from}-${end - 1}`);
-      data = new Uint8Array(asked.response);
-      if (asked.status === 200) data = data.slice(from, end);
+      const part = this.ask(`bytes=${from}-${end - 1}`);
+      data = new Uint8Array(part.response);
+      if (part.status === 200) { // a server without ranges
+        this.bytes = data;
+        return;
+      }
     }
     if (data.length !== end - from) throw new Error("the server sent other bytes than were asked for; the file may have changed");
     for (let k = n; k < until; k++) this.blocks.set(k, data.slice((k - n) * BLOCK, (k - n + 1) * BLOCK));
@@ -107,8 +115,7 @@ class Source {
   }
 }
 
-async function load(wasm) {
-  const module = await WebAssembly.compile(wasm);
+async function load(module) {
   const imports = {};
   for (const { module: from, name, kind } of WebAssembly.Module.imports(module)) {
     if (kind === "function") (imports[from] ??= {})[name] = () => 52; // what a page has not: files of a system, a clock
@@ -123,6 +130,13 @@ async function load(wasm) {
         return 1;
       }
     },
+  };
+  imports.fhash.prior = (number, size) => {
+    priors[number] ??= asked("GET", new URL(PRIORS[number], location.href)).response;
+    const bytes = new Uint8Array(priors[number]), at = library.malloc(bytes.length);
+    new Uint8Array(library.memory.buffer).set(bytes, at);
+    view().setUint32(size, bytes.length, true);
+    return at;
   };
   const instance = await WebAssembly.instantiate(module, imports);
   instance.exports._initialize?.();
@@ -267,6 +281,7 @@ function smoothed(values, shape, deviation, error) {
 
 const work = {
   async open({ wasm, ...given }) {
+    priors = given.priors ?? [];
     library ??= await load(wasm);
     source = new Source(given);
     const context = library.fhash_context_create(0n, 1);
@@ -287,7 +302,7 @@ onmessage = async ({ data: { id, name, given } }) => {
     const moved = [result.values, result.smoothed, result.brickLow, result.brickHigh].flatMap((one) => (one?.buffer ? [one.buffer] : []));
     postMessage({ id, result }, moved);
   } catch (error) {
-    const fatal = error instanceof WebAssembly.RuntimeError || error instanceof RangeError;
-    postMessage({ id, fatal, error: fatal ? "there is not enough memory in this browser for it" : error.message });
+    const full = error instanceof WebAssembly.RuntimeError || error instanceof RangeError;
+    postMessage({ id, fatal: name === "frame", error: full ? "there is not enough memory in this browser for it" : error.message });
   }
 };
