@@ -243,7 +243,14 @@ function sized(canvas, [width, height]) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
 }
 
-function looked(size, coarse) {
+/** Pixels of the part of a picture that shows the volume: the colour bar stands beside it. */
+function viewed([width, height]) {
+  const stage = element("stage").clientWidth, bar = effects().colour_bar && !app.fixedSize ? (84 * width) / Math.max(stage, 1) : 0;
+  return [Math.max(width - bar, width / 2), height];
+}
+
+function looked(whole, coarse) {
+  const size = viewed(whole);
   const { camera = {} } = app.scene, narrower = effects().axes && !app.fixedSize ? (size[0] < size[1] ? 0.82 : 0.9) : 1; // room for the scales
   return look({ scene: { ...app.scene, camera: { ...camera, zoom: (camera.zoom ?? 1) * narrower } }, grid: app.grid, about: variable(), tf: app.tf, frame: app.frame, size, coarse, entries: app.marcher.entries });
 }
@@ -318,6 +325,7 @@ export function setMode(mode) {
   app.mode = app.marcher ? mode : "slices";
   for (const id of ["behind", "volume", "before"]) element(id).hidden = app.mode === "slices";
   element("slices").hidden = app.mode !== "slices";
+  element("stage").classList.toggle("sliced", app.mode === "slices");
   element("volumeTab").setAttribute("aria-pressed", app.mode === "volume");
   element("slicesTab").setAttribute("aria-pressed", app.mode === "slices");
   element("told").textContent = "";
@@ -402,6 +410,7 @@ export const commands = {
       // kept for this page alone
     }
     panel.fill();
+    panel.resized();
     draw();
   },
 };
@@ -448,6 +457,7 @@ function theme() {
   document.documentElement.classList.toggle("dark", kept ? kept === "dark" : dark.matches);
   dark.addEventListener("change", () => {
     if (!kept) document.documentElement.classList.toggle("dark", dark.matches);
+    panel.resized();
     draw();
   });
 }
@@ -465,7 +475,7 @@ function start() {
     setMode("slices");
   }
   pointers(element("before"));
-  new ResizeObserver(() => draw(true)).observe(element("stage"));
+  new ResizeObserver(() => { panel.resized(); draw(true); }).observe(element("stage"));
   const state = stateOfHash(location.hash), url = state.url ?? new URLSearchParams(location.search).get("url");
   const number = Math.max(files.findIndex((one) => one.name === state.file), 0);
   addEventListener("message", ({ data, source }) => {

@@ -156,5 +156,5 @@ export function controls(files) {
     element("timeText").textContent = timeText(variable().coords[0], app.step);
   }
 
-  return { fill, restyled, time };
+  return { fill, restyled, time, resized: () => editor.draw() };
 }

@@ -107,7 +107,7 @@ export function look({ scene, grid, about, tf, frame, size, coarse = 1, entries 
     rays, visible: body !== null, levels: projection ? [] : surfaces.map((one) => one.value), everything: projection > 0,
     table: table(covered, entries, length * grid.vertexSpacing),
     uniforms: {
-      eye: rays.eye, right: rays.right, up: rays.up, forward: rays.forward, parallel: rays.parallel,
+      size, eye: rays.eye, right: rays.right, up: rays.up, forward: rays.forward, parallel: rays.parallel,
       spacing: grid.spacing.map((one) => one / grid.vertexSpacing),
       low: (body ?? grid.bounds).map((ends) => ends[0]), high: (body ?? grid.bounds).map((ends) => ends[1]),
       seenLow: seen.map((ends) => ends?.[0] ?? 0), seenHigh: seen.map((ends) => ends?.[1] ?? -1),

@@ -293,7 +293,7 @@ export class Marcher {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.textures.picture, 0);
   }
 
-  /** March rows first..stop, from the bottom, of a picture of width x height pixels. */
+  /** March rows first..stop, from the bottom, of a picture; its view, uniforms.size, is at the left of it. */
   rows(uniforms, width, height, first, stop) {
     const { gl } = this;
     this.room(width, height);
@@ -303,7 +303,7 @@ export class Marcher {
     gl.scissor(0, first, width, stop - first);
     const march = this.program(uniforms);
     gl.useProgram(march.program);
-    set(gl, march, { volume: 0, bricks: 1, table: 2, warp: 3, smoothed: 4, size: [width, height], ...uniforms });
+    set(gl, march, { volume: 0, bricks: 1, table: 2, warp: 3, smoothed: 4, ...uniforms });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.disable(gl.SCISSOR_TEST);
   }

@@ -80,7 +80,8 @@ export class Slices {
     }
     const packed = new Uint32Array(lookUp.buffer);
     for (const { plane, canvas, name, range } of this.panes) {
-      const [axis, right, up] = plane, figure = canvas.parentElement, room = [figure.clientWidth, figure.clientHeight - 40];
+      const [axis, right, up] = plane, figure = canvas.parentElement, flows = innerWidth <= 800;
+      const room = [figure.clientWidth, flows ? Math.min(figure.clientWidth, 420) : figure.clientHeight - 40];
       const scale = Math.min(room[0] / grid.lengths[right], room[1] / grid.lengths[up]);
       const css = [right, up].map((each) => Math.max(grid.lengths[each] * scale, 24)), dense = Math.min(devicePixelRatio, 2);
       canvas.style.width = `${css[0]}px`;
