@@ -18,9 +18,8 @@ import numpy as np
 from fhash_codec.dataset import open as open_file
 from fhash_codec.rendering.colours import named_map
 from fhash_formats import transform
-from fhash_formats.errors import InputError, MissingDependencyError, MissingInputError
+from fhash_formats.errors import InputError, MissingDependencyError, MissingInputError, OutputError
 from fhash_formats.support.files import check_output, replacing_all
-from fhash_formats.support.values import json_attributes
 
 if TYPE_CHECKING:
     from fhash_codec.volume import Volume
@@ -130,9 +129,12 @@ class Page:
             if name != INDEX and (folder / name).resolve() != path
         }
         outputs = [*(folder / name for name in copies), folder / INDEX]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be made: {error.strerror or error}") from error
         for output in outputs:
             check_output(output, force)
-        folder.mkdir(parents=True, exist_ok=True)
         with replacing_all(outputs, force=force) as temporaries:
             for temporary, path in zip(temporaries[:-1], copies.values(), strict=True):
                 shutil.copyfile(path, temporary)
@@ -221,7 +223,7 @@ def html_of(volume: Volume) -> str:
 
     The slice is of a coarse level of detail, so that little is decoded.
     """
-    attributes = json_attributes(volume.attributes)
+    attributes = volume.container.header["variable"].get("attributes", {})
     quality: Mapping[str, Any] = volume.container.header["quality"]
     rows = {
         "variable": f"{volume.name} [{volume.units}]" if volume.units else volume.name,
