@@ -15,7 +15,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from setuptools import Command, Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
@@ -88,7 +88,10 @@ WASM_SMALL = [
 ]
 """Definitions by which third_party has one way of each thing instead of several."""
 WASM_CPP_FLAGS = ["-fno-threadsafe-statics", "-std=c++17", "-fno-exceptions", "-fno-rtti"]
-WASM_LINK_FLAGS = ["-mexec-model=reactor", "-Wl,-s,--gc-sections,--stack-first,--lto-O2,-z,stack-size=1048576"]
+WASM_LINK_FLAGS = [
+    "-mexec-model=reactor",
+    "-Wl,-s,--gc-sections,--stack-first,--lto-O2,-z,stack-size=1048576",
+]
 WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
 """Functions that a page has no use for: there are no paths, and nothing is encoded."""
 
@@ -169,7 +172,7 @@ class BuildWasm(Command):
     """`wasm`: the functions of fhash.h for browsers, by Clang 14 and the libraries of wasi."""
 
     description = "compile the decoder of the page of `fhash view`"
-    user_options: list[tuple[str, str | None, str]] = []
+    user_options: ClassVar[list[tuple[str, str | None, str]]] = []
 
     def initialize_options(self) -> None:
         """Nothing can be chosen."""
@@ -197,12 +200,16 @@ class BuildWasm(Command):
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(compiled, sources))
-        declared = re.findall(r"FHASH_API [^;(]*?(fhash_\w+)\(", (FORMATS / "fhash.h").read_text("utf-8"))
+        declared = re.findall(
+            r"FHASH_API [^;(]*?(fhash_\w+)\(", (FORMATS / "fhash.h").read_text("utf-8")
+        )
         names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
         exports = [f"-Wl,--export={name}" for name in names]
         self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
         self._run("wasm-opt", "-Os", "--enable-simd", "--strip-producers", WASM, "-o", WASM)
-        read = sorted({*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")})
+        read = sorted(
+            {*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")}
+        )
         digests = {
             path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in [*read, WASM]
         }

@@ -1,4 +1,4 @@
-"""The page of `fhash view`: what a server gives, copies for other servers, and pages in notebooks."""
+"""The page of `fhash view`: for a server, copied for other servers, and in notebooks."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from fhash_codec.dataset import open as open_file
+from fhash_codec.boxes import Box
 from fhash_codec.rendering.colours import named_map
 from fhash_formats import transform
+from fhash_formats.container import Container
 from fhash_formats.errors import InputError, MissingDependencyError, MissingInputError, OutputError
 from fhash_formats.support.files import check_output, replacing_all
 
@@ -68,14 +69,16 @@ class Page:
     hint = "no such file; open {url} in a browser"
 
     def __init__(self, runs: Sequence[str | Path]) -> None:
-        """Look at containers; raises what opening them raises, and InputError for what is remote."""
+        """Look at containers; raises what opening raises, and InputError for what is remote."""
         self._files = _files()
         self.runs: dict[str, Path] = {}
         for run in runs:
             path = Path(run)
             if "://" in str(run):
-                raise InputError(f"{run}: only files of this machine are given; open a URL by the page's Open")
-            open_file(path).close()
+                raise InputError(
+                    f"{run}: only files of this machine are given; the page opens a URL by Open"
+                )
+            Container.open(path).close()
             name, number = path.name, 2
             while name in self.runs or name in self._files:
                 name, number = f"{number}-{path.name}", number + 1
@@ -102,7 +105,9 @@ class Page:
 
     def kind(self, key: str) -> str:
         """The media type of a key."""
-        return KINDS.get(Path(key or INDEX).suffix if key not in self.runs else "", "application/octet-stream")
+        return KINDS.get(
+            Path(key or INDEX).suffix if key not in self.runs else "", "application/octet-stream"
+        )
 
     def pieces(self, key: str, first: int, end: int) -> Iterator[bytes]:
         """Yield the bytes of a key that there is, from `first` to before `end`."""
@@ -181,8 +186,9 @@ function render({ model, el }) {
   const bytes = (one) => new Uint8Array(one.buffer, one.byteOffset, one.byteLength).slice().buffer;
   const answer = ({ data, source }) => {
     if (source !== frame.contentWindow || !data?.fhashReady) return;
-    frame.contentWindow.postMessage({ fhash: { name: model.get("name"), bytes: bytes(model.get("bytes")),
-      wasm: bytes(model.get("wasm")), priors: model.get("priors").map(bytes), script } }, "*");
+    const [name, priors] = [model.get("name"), model.get("priors").map(bytes)];
+    const given = { name, priors, script, bytes: bytes(model.get("bytes")) };
+    frame.contentWindow.postMessage({ fhash: { ...given, wasm: bytes(model.get("wasm")) } }, "*");
   };
   addEventListener("message", answer);
   frame.srcdoc = model.get("page");
@@ -204,10 +210,14 @@ def widget(path: str | Path, height: int) -> Any:
         import anywidget
         import traitlets
     except ImportError as error:
-        raise MissingDependencyError("view needs anywidget; pip install 'fhash[notebook]'") from error
+        raise MissingDependencyError(
+            "view needs anywidget; pip install 'fhash[notebook]'"
+        ) from error
     path = Path(path)
     if not path.is_file():
-        raise MissingInputError(f"{path}: no file of this machine; fhash view shows it in a browser")
+        raise MissingInputError(
+            f"{path}: no file of this machine; fhash view shows it in a browser"
+        )
     if path.stat().st_size > MOST_EMBEDDED:
         raise InputError(
             f"{path}: larger than {MOST_EMBEDDED >> 20} MiB; use `fhash view`, which reads parts"
@@ -231,18 +241,22 @@ def html_of(volume: Volume) -> str:
         "t, z, y, x": ", ".join(map(str, volume.shape)),
         "type": str(volume.dtype),
         "range": f"{volume.value_range.low:g} to {volume.value_range.high:g}",
-        "largest error": "" if quality.get("max_abs_error") is None else f"{quality['max_abs_error']:g}",
+        "largest error": ""
+        if quality.get("max_abs_error") is None
+        else f"{quality['max_abs_error']:g}",
         "PSNR": "" if quality.get("psnr") is None else f"{quality['psnr']:.2f} dB",
         "file": str(volume.path),
     }
     cells = "".join(
-        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td>{html.escape(str(text))}</td></tr>"
+        f"<tr><th style='text-align:left'>{name}</th><td>{html.escape(str(text))}</td></tr>"
         for name, text in rows.items()
         if text
     )
     picture = base64.b64encode(_slice(volume)).decode()
     image = f"<img alt='middle slice' src='data:image/png;base64,{picture}'>"
-    return f"<div style='display:flex;gap:1em;align-items:center'>{image}<table>{cells}</table></div>"
+    return (
+        f"<div style='display:flex;gap:1em;align-items:center'>{image}<table>{cells}</table></div>"
+    )
 
 
 def _slice(volume: Volume) -> bytes:
@@ -256,7 +270,7 @@ def _slice(volume: Volume) -> bytes:
     middle = volume.shape[1 + axis] // 2 >> lod << lod
     region = [(0, n) for n in volume.shape[1:]]
     region[axis] = (middle, middle + 1)
-    values = np.asarray(volume.read_lod(0, lod, region), dtype=np.float64).squeeze(axis)
+    values = np.asarray(volume.read_lod(0, lod, Box.of(region)), dtype=np.float64).squeeze(axis)
     low, high = volume.value_range.low, volume.value_range.high
     share = (values - low) / ((high - low) or 1.0)
     colours = np.concatenate([named_map("viridis")(share), ~np.isnan(values)[..., None]], axis=-1)
@@ -269,4 +283,3 @@ def _slice(volume: Volume) -> bytes:
     file = io.BytesIO()
     image.save(file, format="PNG")
     return file.getvalue()
-

@@ -97,7 +97,7 @@ class View(Protocol):
     """Bytes by keys."""
 
     hint: str
-    """What a client is told that asks for an unknown key; `{url}` stands for that of the server."""
+    """Answer to a client that asks for an unknown key; `{url}` stands for that of the server."""
 
     def tag_of(self, key: str) -> str:
         """Text that differs where the bytes of a key may."""
@@ -317,9 +317,7 @@ class _Handler(BaseHTTPRequestHandler):
                 sent += len(piece)
             self.close_connection |= sent != end - first  # of a file that was cut meanwhile
 
-    def _first(
-        self, key: str, pieces: Iterator[bytes | memoryview]
-    ) -> bytes | memoryview | None:
+    def _first(self, key: str, pieces: Iterator[bytes | memoryview]) -> bytes | memoryview | None:
         """The first piece of a key; None where it could not be had, which the client was told."""
         try:
             return next(pieces, b"")

@@ -1,16 +1,18 @@
-// The page of `fhash view`: files that JavaScript reads, and priors that it fetches when they are needed.
+// The page of `fhash view`: files that JavaScript reads, and priors that it fetches when needed.
 #if defined(__wasm__)
 #include "fhash.h"
 #include "priors.hpp"
 
-#define FHASH_OF_PAGE(name) extern "C" __attribute__((import_module("fhash"), import_name(name)))
+#define OF_PAGE(name) extern "C" __attribute__((import_module("fhash"), import_name(name)))
 
 // Reads `length` bytes from `offset` on of file number `file` of the page; not 0 where it cannot.
-FHASH_OF_PAGE("read") int32_t fhash_page_read(double file, double offset, double length, void* bytes);
-// The file of a prior, which stays where it is; `size` gets its bytes. It does not return without it.
-FHASH_OF_PAGE("prior") const uint8_t* fhash_page_prior(int32_t number, size_t* size);
+OF_PAGE("read") int32_t fhash_page_read(double file, double offset, double length, void* bytes);
+// The file of a prior, which stays where it is; `size` gets its bytes. Does not return without it.
+OF_PAGE("prior") const uint8_t* fhash_page_prior(int32_t number, size_t* size);
 
-const uint8_t* fhash::prior_bytes(int number, size_t* size) { return fhash_page_prior(number, size); }
+const uint8_t* fhash::prior_bytes(int number, size_t* size) {
+    return fhash_page_prior(number, size);
+}
 
 namespace {
 

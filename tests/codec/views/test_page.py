@@ -34,7 +34,7 @@ from fhash_codec import EncodeConfig
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import SCENE_KEY, Scene, scene_in_png, text_in_png
-from fhash_codec.views.page import FOLDER, PRIORS, Page, embedded
+from fhash_codec.views.page import FOLDER, PRIORS, WIDGET, Page, embedded
 from fhash_codec.views.server import Server
 from fhash_formats import native, transform
 from fhash_formats.errors import InputError, MissingDependencyError, OutputExistsError
@@ -49,7 +49,7 @@ in_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium"
 ENDS = ("--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 QUIET = ("--disable-quic", "--no-first-run", "--disable-component-update", "--disable-sync")
 SOFTWARE = "GPU stall due to ReadPixels"
-"""What Chromium says of its own compositor where there is no graphics card."""
+"""Words of Chromium about its own compositor, where there is no graphics card."""
 
 
 class Tab:
@@ -100,7 +100,11 @@ class Tab:
         self.number += 1
         data = json.dumps({"id": self.number, "method": method, "params": given}).encode()
         size = len(data)
-        head = bytes([0xFE]) + struct.pack(">H", size) if size < 65536 else b"\xff" + struct.pack(">Q", size)
+        head = (
+            bytes([0xFE]) + struct.pack(">H", size)
+            if size < 65536
+            else b"\xff" + struct.pack(">Q", size)
+        )
         head = bytes([0x80 | size]) if size < 126 else head
         self.socket.sendall(b"\x81" + head + bytes(4) + data)  # masked by zeros
         while True:
@@ -123,7 +127,9 @@ class Tab:
 
     def run(self, code: str) -> Any:
         """The value of an expression of the page; raises AssertionError where it fails."""
-        answer = self.call("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
+        answer = self.call(
+            "Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in answer, json.dumps(answer["exceptionDetails"])[:800]
         return answer["result"].get("value")
 
@@ -131,14 +137,24 @@ class Tab:
         """Wait until an expression is true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            if self.run(f"(() => {{ try {{ return Boolean({code}) }} catch {{ return false }} }})()"):
+            if self.run(
+                f"(() => {{ try {{ return Boolean({code}) }} catch {{ return false }} }})()"
+            ):
                 return
             time.sleep(0.03)
-        raise AssertionError(f"{code} did not come true: {self.run('document.body.innerText')[:600]}")
+        raise AssertionError(
+            f"{code} did not come true: {self.run('document.body.innerText')[:600]}"
+        )
 
     def go(self, url: str, width: int = 700, height: int = 560) -> None:
         """Load a page in a window of a size."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         self.call("Page.navigate", url="about:blank")
         self.events.clear()
         self.call("Page.navigate", url=url)
@@ -155,6 +171,11 @@ class Tab:
             self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, **mouse)
         self.call("Input.dispatchMouseEvent", type="mouseReleased", x=stop[0], y=stop[1], **mouse)
 
+    def box(self, selector: str) -> list[float]:
+        """Left, top, width and height of an element, in pixels."""
+        found = f"document.querySelector('{selector}').getBoundingClientRect()"
+        return [float(self.run(f"{found}.{name}")) for name in ("x", "y", "width", "height")]
+
     def shot(self, name: str) -> None:
         """Keep a screenshot of the long version."""
         if LONG:
@@ -163,10 +184,12 @@ class Tab:
             Path(LONG, f"{name}.png").write_bytes(base64.b64decode(data))
 
     def complaints(self) -> list[str]:
-        """What the console was told."""
+        """Messages of the console."""
         self.run("new Promise((done) => setTimeout(done, 50))")
         kinds = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
-        told = [json.dumps(event["params"])[:600] for event in self.events if event["method"] in kinds]
+        told = [
+            json.dumps(event["params"])[:600] for event in self.events if event["method"] in kinds
+        ]
         return [line for line in told if SOFTWARE not in line]
 
     def picture(self, scene: dict[str, Any]) -> np.ndarray:
@@ -227,10 +250,18 @@ def figures(**found: Any) -> None:
 
 def test_decoder_is_that_of_its_sources() -> None:
     digests = json.loads(WASM.with_suffix(".wasm.json").read_text())
-    stale = [name for name, digest in digests.items() if hashlib.sha256((ROOT / name).read_bytes()).hexdigest() != digest]
+    stale = [
+        name
+        for name, digest in digests.items()
+        if hashlib.sha256((ROOT / name).read_bytes()).hexdigest() != digest
+    ]
     assert not stale, f"`make wasm`: {stale} changed"
     folder = ROOT / "formats/fhash_formats/native"
-    there = {path.relative_to(ROOT).as_posix() for kind in ("cpp", "c", "hpp", "h", "inc") for path in folder.rglob(f"*.{kind}")}
+    there = {
+        path.relative_to(ROOT).as_posix()
+        for kind in ("cpp", "c", "hpp", "h", "inc")
+        for path in folder.rglob(f"*.{kind}")
+    }
     assert there == {name for name in digests if "/native/" in name}
 
 
@@ -244,7 +275,9 @@ def test_page_is_small() -> None:
 
 
 def test_colour_maps_are_those_of_fhash() -> None:
-    rows = re.findall(r'^  (\w+): "([0-9a-f ]+)",$', (FOLDER / "colours.js").read_text(), re.MULTILINE)
+    rows = re.findall(
+        r'^  (\w+): "([0-9a-f ]+)",$', (FOLDER / "colours.js").read_text(), re.MULTILINE
+    )
     assert {name: tuple(colours.split()) for name, colours in rows} == COLOUR_MAPS
 
 
@@ -262,24 +295,42 @@ def test_decoder_gives_the_bits_of_the_library() -> None:
         for number, step, lod, digest in found[str(run)]:
             values, profile = read_natively(library, run, number, step, lod)
             if profile == "compact":  # a network is no stream: its last bits are the machine's
-                assert digest == hashlib.sha256(values.tobytes()).hexdigest(), (run.name, number, step, lod)
+                assert digest == hashlib.sha256(values.tobytes()).hexdigest(), (
+                    run.name,
+                    number,
+                    step,
+                    lod,
+                )
                 compared += 1
     assert compared > 100
 
 
-def read_natively(library: ctypes.CDLL, run: Path, number: int, step: float, lod: int) -> tuple[np.ndarray, str]:
+def read_natively(
+    library: ctypes.CDLL, run: Path, number: int, step: float, lod: int
+) -> tuple[np.ndarray, str]:
     """A step as float64 with one kind of NaN, by the library of this machine, and the profile."""
     create, read = library.fhash_context_create, library.fhash_read
     create.restype = ctypes.c_void_p
     context = ctypes.c_void_p(create(ctypes.c_uint64(0), 1))
     file, error = ctypes.c_void_p(), ctypes.create_string_buffer(504)
-    assert not library.fhash_open_path(context, str(run).encode(), ctypes.byref(file), error), error.raw[4:]
+    assert not library.fhash_open_path(context, str(run).encode(), ctypes.byref(file), error), (
+        error.raw[4:]
+    )
     library.fhash_header.restype = ctypes.c_char_p
     headers = json.loads(library.fhash_header(file))["variables"]
     header = list(headers.values() if isinstance(headers, dict) else headers)[number]
     shape = [-(-n // 2**lod) for n in header["domain"]["shape"][1:]]
     values = np.empty(shape)
-    read.argtypes = [ctypes.c_void_p, ctypes.c_int32, ctypes.c_double, ctypes.c_void_p, ctypes.c_int32, ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p]
+    read.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_int32,
+        ctypes.c_double,
+        ctypes.c_void_p,
+        ctypes.c_int32,
+        ctypes.c_int32,
+        ctypes.c_void_p,
+        ctypes.c_void_p,
+    ]
     assert not read(file, number, step, None, lod, 11, values.ctypes.data, error), error.raw[4:]
     library.fhash_close.argtypes = library.fhash_context_destroy.argtypes = [ctypes.c_void_p]
     library.fhash_close(file)
@@ -318,8 +369,17 @@ def test_server_gives_page_and_container_alone(whole: Path, tmp_path: Path) -> N
         assert ask(url, name)[2] == whole.read_bytes()
         assert ask(url, "fhash.wasm")[1]["Content-Type"] == "application/wasm"
         assert ask(url, "app.js")[1]["Content-Type"].startswith("text/javascript")
-        assert ask(url, "prior.bin")[2] == Path(transform.__file__).with_name("prior.bin").read_bytes()
-        for other in ("secret.txt", "../secret.txt", "..%2Fsecret.txt", str(secret), "fhash.wasm.json", "page/app.js"):
+        assert (
+            ask(url, "prior.bin")[2] == Path(transform.__file__).with_name("prior.bin").read_bytes()
+        )
+        for other in (
+            "secret.txt",
+            "../secret.txt",
+            "..%2Fsecret.txt",
+            str(secret),
+            "fhash.wasm.json",
+            "page/app.js",
+        ):
             assert ask(url, other)[0] == 404, other
         assert ask(url, name, Host="example.org")[0] == 421
         tag = ask(url, name)[1]["ETag"]
@@ -339,14 +399,16 @@ def test_containers_of_one_name_are_told_apart(whole: Path, tmp_path: Path) -> N
 
 def test_copy_for_any_server(whole: Path, tmp_path: Path) -> None:
     runner = CliRunner()
-    done = runner.invoke(program, ["view", str(whole), "--static", str(tmp_path / "site"), "--json"])
+    done = runner.invoke(
+        program, ["view", str(whole), "--static", str(tmp_path / "site"), "--json"]
+    )
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout)
     names = {Path(name).name for name in report["files"]}
     assert names >= {"index.html", "app.js", "fhash.wasm", "whole.fhz", *PRIORS}
     assert (tmp_path / "site/whole.fhz").read_bytes() == whole.read_bytes()
     again = runner.invoke(program, ["view", str(whole), "--static", str(tmp_path / "site")])
-    assert isinstance(again.exception, SystemExit) and again.exit_code == 2
+    assert again.exit_code == 2
     (tmp_path / "site/app.js").write_text("mine")
     with pytest.raises(OutputExistsError):
         Page([whole]).write(tmp_path / "site")
@@ -402,7 +464,7 @@ def test_page_shows_turns_plays_and_edits(tab: Tab, steady: Path) -> None:
         assert tab.run("fhash.picture().toDataURL()") != before
         assert tab.run("fhash.app.scene.camera.azimuth") < -5
         points = tab.run("fhash.app.tf.points.length")
-        box = tab.run("(({x, y, width, height}) => [x, y, width, height])(document.getElementById('editor').getBoundingClientRect())")
+        box = tab.box("#editor")
         place = int(box[0] + box[2] / 2), int(box[1] + box[3] / 4)
         tab.drag(place, (place[0] + 10, place[1] + 15))
         tab.drawn()
@@ -413,7 +475,9 @@ def test_page_shows_turns_plays_and_edits(tab: Tab, steady: Path) -> None:
         tab.drawn()
         assert page.bytes <= 2 * steady.stat().st_size
         for key in ("d", "v", "v", ".", "+", "2", "ArrowLeft"):
-            tab.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key if len(key) == 1 else "")
+            tab.call(
+                "Input.dispatchKeyEvent", type="keyDown", key=key, text=key if len(key) == 1 else ""
+            )
         tab.drawn()
         tab.shot("short-1400")
         tab.go(url, 480, 900)
@@ -421,7 +485,9 @@ def test_page_shows_turns_plays_and_edits(tab: Tab, steady: Path) -> None:
         assert tab.run("document.documentElement.scrollWidth") <= 480
         tab.shot("short-480")
         assert tab.complaints() == []
-    figures(what="steady", file=steady.stat().st_size, first=first, last=(page.requests, page.bytes))
+    figures(
+        what="steady", file=steady.stat().st_size, first=first, last=(page.requests, page.bytes)
+    )
 
 
 def decibels(mine: np.ndarray, theirs: np.ndarray, where: np.ndarray) -> float:
@@ -434,16 +500,31 @@ def scenes(low: float, high: float) -> dict[str, tuple[float, dict[str, Any]]]:
     """Scenes by name, each with the PSNR that the page must reach."""
     at = [low + share * (high - low) for share in (0.2, 0.4, 0.5, 1.0)]
     opacity = [[at[0], 0], [at[2], 0.2], [at[3], 0.6]]
-    base = {"camera": {"azimuth": 20, "elevation": 10}, "size": [192, 160], "march": {"lod": 0}, "effects": {}}
+    base = {
+        "camera": {"azimuth": 20, "elevation": 10},
+        "size": [192, 160],
+        "march": {"lod": 0},
+        "effects": {},
+    }
     volume = base | {"transfer_function": {"opacity": opacity, "colours": "turbo"}}
     surface = {"isosurfaces": [{"value": at[1], "colour": "#c04020"}]}
     return {
         "volume": (45, volume),
         "time": (45, volume | {"step": 2.5, "background": "#101018"}),
         "shading": (40, volume | {"effects": {"shading": {"light": [1, 0, 1]}}}),
-        "clip": (45, volume | {"effects": {"clip": {"planes": [{"normal": [1, 1, 1], "offset": 40}]}}}),
+        "clip": (
+            45,
+            volume | {"effects": {"clip": {"planes": [{"normal": [1, 1, 1], "offset": 40}]}}},
+        ),
         "surface": (35, base | {"transfer_function": {"nothing": True}, "effects": surface}),
-        "maximum": (45, volume | {"effects": {"maximum_intensity": True}, "camera": {"projection": "parallel", "zoom": 1.4}}),
+        "maximum": (
+            45,
+            volume
+            | {
+                "effects": {"maximum_intensity": True},
+                "camera": {"projection": "parallel", "zoom": 1.4},
+            },
+        ),
     }
 
 
@@ -467,7 +548,11 @@ def test_scenes_go_in_and_out(tab: Tab, steady: Path, tmp_path: Path) -> None:
         "camera": {"view": "xz", "zoom": 1.2},
         "step": 2,
         "background": "#203040",
-        "transfer_function": {"opacity": [[0, 0], [90, 0.5]], "colours": "plasma_r", "density": 2.0},
+        "transfer_function": {
+            "opacity": [[0, 0], [90, 0.5]],
+            "colours": "plasma_r",
+            "density": 2.0,
+        },
         "effects": {"box": True, "isosurfaces": [{"value": 50.0}], "shadows": True},
     }
     with serving(Page([steady])) as url:
@@ -508,29 +593,42 @@ def test_slices_need_no_webgl(tab: Tab, feature: Path) -> None:
         tab.go(f"{url}?no-webgl")
         tab.until("fhash.app.frame && fhash.app.frame.lod === 0 && !fhash.app.dirty")
         assert tab.run("document.getElementById('volumeTab').disabled")
-        box = tab.run("(({x, y, width, height}) => [x, y, width, height])(document.querySelector('figure canvas').getBoundingClientRect())")
-        tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=box[0] + box[2] / 2, y=box[1] + box[3] / 2)
+        box = tab.box("figure canvas")
+        tab.call(
+            "Input.dispatchMouseEvent",
+            type="mouseMoved",
+            x=box[0] + box[2] / 2,
+            y=box[1] + box[3] / 2,
+        )
         tab.until("document.getElementById('told').textContent")
         told = tab.run("document.getElementById('told').textContent")
-        value, x, y, z = re.match(r"(\S+)(?: kg m-3)? at lon (\S+), lat (\S+), height (\S+)", told).groups()  # type: ignore[union-attr]
-        place = [int(np.argmin(np.abs(volume.coords[axis].values - float(at)))) for axis, at in zip("zyx", (z, y, x), strict=True)]
+        value, x, y, z = re.match(
+            r"(\S+)(?: kg m-3)? at lon (\S+), lat (\S+), height (\S+)", told
+        ).groups()  # type: ignore[union-attr]
+        place = [
+            int(np.argmin(np.abs(volume.coords[axis].values - float(at))))
+            for axis, at in zip("zyx", (z, y, x), strict=True)
+        ]
         assert float(value) == pytest.approx(float(volume.read(0)[*place]), rel=1e-5)
         tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=box[0] + 3, y=box[1] + 3)
         tab.until("document.getElementById('told').textContent.startsWith('no value')")
-        transparent = tab.run(
-            "(() => { const c = document.querySelector('figure canvas'); const d = c.getContext('2d').getImageData(2, 2, 1, 1).data; return d[3]; })()"
-        )
+        corner = "document.querySelector('figure canvas').getContext('2d').getImageData(2, 2, 1, 1)"
+        transparent = tab.run(f"{corner}.data[3]")
         assert transparent == 0
         assert tab.complaints() == []
 
 
 @in_chromium
 @pytest.mark.parametrize("kind", ["cut", "noise", "empty", "tile", "gone"])
-def test_bad_files_are_one_clear_line(tab: Tab, whole: Path, damaged: Path, tmp_path: Path, kind: str) -> None:
+def test_bad_files_are_one_clear_line(
+    tab: Tab, whole: Path, damaged: Path, tmp_path: Path, kind: str
+) -> None:
     run = tmp_path / "run.fhz"
     shutil.copy(damaged if kind == "tile" else whole, run)
     page = Page([run])
-    data = {"cut": whole.read_bytes()[:-300], "noise": bytes(range(256)) * 40, "empty": b""}.get(kind)
+    data = {"cut": whole.read_bytes()[:-300], "noise": bytes(range(256)) * 40, "empty": b""}.get(
+        kind
+    )
     if data is not None:
         run.write_bytes(data)
     if kind == "gone":
@@ -541,7 +639,8 @@ def test_bad_files_are_one_clear_line(tab: Tab, whole: Path, damaged: Path, tmp_
         line = tab.run("document.getElementById('message').textContent")
         assert line.startswith("run.fhz: ")
         assert len(line) < 250
-        assert "undefined" not in line and "wasm" not in line
+        assert "undefined" not in line
+        assert "wasm" not in line
         told = tab.complaints()
         assert not told or kind in ("empty", "gone")  # the browser tells of 404 and 416 itself
 
@@ -549,22 +648,34 @@ def test_bad_files_are_one_clear_line(tab: Tab, whole: Path, damaged: Path, tmp_
 @in_chromium
 def test_page_in_a_notebook(tab: Tab, steady: Path, tmp_path: Path) -> None:
     page, sent = embedded()
-    packed = {name: base64.b64encode(each).decode() for name, each in (("wasm", sent["wasm"]), ("bytes", steady.read_bytes()))}
-    packed["priors"] = [base64.b64encode(each).decode() for each in sent["priors"]]  # type: ignore[assignment]
-    from fhash_codec.views.page import WIDGET
-
+    packed: dict[str, Any] = {
+        name: base64.b64encode(each).decode()
+        for name, each in (("wasm", sent["wasm"]), ("bytes", steady.read_bytes()))
+    }
+    packed["priors"] = [base64.b64encode(each).decode() for each in sent["priors"]]
     host = tmp_path / "host.html"
-    values = json.dumps({"page": page, "script": sent["script"], "name": "steady.fhz", "height": 500, "packed": packed}).replace("<", "\\u003c")
+    values = {"page": page, "script": sent["script"], "name": "steady.fhz", "height": 500}
+    given = json.dumps(values | packed).replace("<", "\\u003c")
     host.write_text(
         "<!DOCTYPE html><link rel=icon href='data:,'><div id=el></div><script type=module>"
         + WIDGET.replace("export default { render };", "")
-        + f"const v = {values}; const d = (t) => {{ const b = Uint8Array.from(atob(t), (c) => c.charCodeAt(0)); return new DataView(b.buffer); }};"
-        "const all = { ...v, wasm: d(v.packed.wasm), bytes: d(v.packed.bytes), priors: v.packed.priors.map(d) };"
-        "render({ model: { get: (name) => all[name] }, el: document.getElementById('el') });</script>"
+        + f"""
+        const bytes = (text) => Uint8Array.from(atob(text), (one) => one.charCodeAt(0));
+        const view = (text) => new DataView(bytes(text).buffer);
+        const given = {given};
+        const all = {{ ...given, wasm: view(given.wasm), bytes: view(given.bytes) }};
+        all.priors = given.priors.map(view);
+        render({{ model: {{ get: (name) => all[name] }}, el: document.getElementById("el") }});
+        </script>"""
     )
     tab.go(host.as_uri(), 900, 600)
     tab.until("document.querySelector('iframe').contentWindow.fhash.app.sharp")
-    assert tab.run("document.querySelector('iframe').contentDocument.getElementById('title').textContent") == "steady.fhz"
+    assert (
+        tab.run(
+            "document.querySelector('iframe').contentDocument.getElementById('title').textContent"
+        )
+        == "steady.fhz"
+    )
     assert tab.complaints() == []
 
 
@@ -591,7 +702,14 @@ def test_real_and_large_files(tab: Tab, tmp_path: Path) -> None:
             for step in range(last + 1):
                 tab.run(f"fhash.go({step})")
             tab.drawn()
-            figures(what=name, bytes=run.stat().st_size, first=first, last=(page.requests, page.bytes), seconds_to_first=round(shown, 2), frames=round(frames, 1))
+            figures(
+                what=name,
+                bytes=run.stat().st_size,
+                first=first,
+                last=(page.requests, page.bytes),
+                seconds_to_first=round(shown, 2),
+                frames=round(frames, 1),
+            )
             tab.run("document.getElementById('slicesTab').click()")
             tab.run("new Promise((done) => setTimeout(done, 500))")
             tab.shot(f"{name}-slices")
@@ -600,7 +718,9 @@ def test_real_and_large_files(tab: Tab, tmp_path: Path) -> None:
             tab.shot(f"{name}-480")
             assert tab.complaints() == []
             with fhash_codec.open(run) as volume:
-                for each, (_, scene) in scenes(volume.value_range.low, volume.value_range.high).items():
+                for each, (_, scene) in scenes(
+                    volume.value_range.low, volume.value_range.high
+                ).items():
                     scene = scene | {"size": [384, 384]}
                     image = Renderer(volume).render(Scene.from_dict(scene))
                     found = decibels(tab.picture(scene), image.to_uint8(), image.rgba[..., 3] > 0)
@@ -621,9 +741,12 @@ def large(folder: Path) -> Path:
     """A container of about 50 MB: waves and noise, so that it does not become small."""
     path = folder / "large.fhz"
     rng = np.random.default_rng(1)
-    z, y, x = np.meshgrid(*3 * [np.linspace(-1, 1, 192, dtype=np.float32)], indexing="ij", sparse=True)
+    z, y, x = np.meshgrid(
+        *3 * [np.linspace(-1, 1, 192, dtype=np.float32)], indexing="ij", sparse=True
+    )
     frames = [
-        np.exp(-4 * ((x - 0.1 * t) ** 2 + y**2 + (z + 0.05 * t) ** 2)) + 0.1 * np.sin(9 * x + t) * np.cos(7 * y * z)
+        np.exp(-4 * ((x - 0.1 * t) ** 2 + y**2 + (z + 0.05 * t) ** 2))
+        + 0.1 * np.sin(9 * x + t) * np.cos(7 * y * z)
         + rng.normal(0, 0.01, (192, 192, 192)).astype(np.float32)
         for t in range(6)
     ]
