@@ -58,8 +58,9 @@ THIRD_PARTY: list[tuple[str, str | None]] = [
     ("ZSTDERRORLIB_VISIBLE", ""),
     ("ZSTD_DISABLE_ASM", "1"),
     ("ZSTD_TRACE", "0"),
+    ("FHASH_BUILDING", "1"),
 ]
-"""Definitions by which a library exports nothing of third_party."""
+"""Definitions by which a library exports nothing of third_party, but its own public functions."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 

@@ -38,8 +38,7 @@ from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotSto
 from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import exact_number, is_within
-from fhash_formats.transform.decoding import decode_tile
-from fhash_formats.transform.encoding import TRELLIS_WEIGHT, WEIGHT, CodedTile
+from fhash_formats.transform.tile import TRELLIS_WEIGHT, WEIGHT, CodedTile, decode_tile
 from fhash_formats.transform.tile_format import TileSettings, parse_stream
 
 ROUNDED_ONCE = 1 - 1e-12

@@ -44,8 +44,7 @@ from fhash_formats.series import AXES, Series
 from fhash_formats.support.files import check_output, replacing
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.support.values import plain_json
-from fhash_formats.transform.decoding import transform_for
-from fhash_formats.transform.encoding import RATIOS
+from fhash_formats.transform.tile import DENSITIES
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 MAX_TILE_LENGTH = 1 << 24
@@ -102,8 +101,8 @@ class Recipe:
         filling = None
         if record.has("filling"):
             told = record.record("filling")
-            density = told.integer("density", 0, max(RATIOS))
-            told.need(density in (0, *RATIOS), "density", f"0 or one of {list(RATIOS)}")
+            density = told.integer("density", 0, max(DENSITIES))
+            told.need(density in (0, *DENSITIES), "density", f"0 or one of {list(DENSITIES)}")
             filling = _settings(told, (t, z, y, x)), density
         return cls(
             tile=(t, z, y, x),
@@ -116,7 +115,7 @@ class Recipe:
 def _settings(record: Record, tile: Shape) -> TileSettings:
     """The settings of a record for tiles of a shape; raises InputError or DamagedFileError."""
     settings = TileSettings.from_text(record.text("settings"))
-    transform_for(settings, tile)  # refuses bases of other lengths
+    settings.transform.check(tile)
     return settings
 
 
@@ -126,9 +125,9 @@ def _coding(record: Record) -> Coding:
     for name, switch in options.items():
         record.need(isinstance(switch, bool), name, "true or false")
     options |= {name: record.integer(name, 0, MAX_COUNT) for name in _COUNTS}
-    density = record.integer("density", 0, max(RATIOS))
+    density = record.integer("density", 0, max(DENSITIES))
     none_needed = density == 0 and options["filled"]
-    record.need(none_needed or density in RATIOS, "density", f"one of {list(RATIOS)}")
+    record.need(none_needed or density in DENSITIES, "density", f"one of {list(DENSITIES)}")
     weight, error = record.number("weight"), record.number_or_null("error")
     record.need(weight >= 0, "weight", "a number from 0 on")
     record.need(error is None or error >= 0, "error", "a number from 0 on, or null")

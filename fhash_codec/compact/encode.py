@@ -64,7 +64,7 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.series import Series
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.tile import decode_tile
 from fhash_formats.transform.values import at_origin
 
 DecodedTiles = Mapping[Index, npt.NDArray[Any]]

@@ -31,10 +31,8 @@ from fhash_codec.compact.tiles import (
 from fhash_codec.features.features import Feature, Interval, Isosurface, Segmentation
 from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead
-from fhash_formats.transform.coder import MAX_EDGES, MAX_REACH, UNIT, MaskLevels, foretell
-from fhash_formats.transform.decoding import transform_for
-from fhash_formats.transform.encoding import WEIGHT, filled, plain_step
-from fhash_formats.transform.lifting import band_table
+from fhash_formats.transform.coder import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
+from fhash_formats.transform.tile import WEIGHT, filled, foretell, forward, plain_step
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import all_finite
 
@@ -46,7 +44,7 @@ def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
 
     settings: transform and step for which the values shall be cheap; with other settings they are
         still better than the values of the source.
-    density: thoroughness, see `fhash_formats.transform.encoding.filled`; with 0 the values of
+    density: thoroughness, see `fhash_formats.transform.tile.filled`; with 0 the values of
         the source stay if all of them are finite.
     """
     values, in_coreset = tile
@@ -63,8 +61,7 @@ def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
     center = settings.dtype.type(settings.center)
     with np.errstate(over="ignore", invalid="ignore"):
         target = np.where(finite, values, 0).astype(settings.dtype) - center
-        transform = transform_for(settings, values.shape)
-        filling = filled(target, counted, finite, transform, settings, density) + center
+        filling = filled(target, counted, finite, settings, density) + center
         # Beyond the range there is nothing to gain, and a type may have no such numbers.
         filling = np.clip(filling, settings.low, settings.high)
         if values.dtype.kind != "f":
@@ -361,10 +358,8 @@ def _price(tile: Tile, settings: TileSettings, coding: Coding) -> Outcome:
     values = tile.values.astype(np.float32) - np.float32(settings.center)
     if not all_finite(values):
         np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    coefficients = transform_for(settings, values.shape).forward(values)
-    step = plain_step(settings)
-    table = band_table(settings.transform, values.shape)
-    size, squares = foretell(coefficients, table, 1 / step, WEIGHT)
+    coefficients, step = forward(values, settings), plain_step(settings)
+    size, squares = foretell(coefficients, settings, 1 / step, WEIGHT)
     squares *= step * step
     if coding.error:
         size += _residual_bytes(math.sqrt(squares / values.size), settings.quantum) * values.size

@@ -44,7 +44,7 @@ from fhash_codec.compact.transform import (
 )
 from fhash_codec.measure.value_range import ValueRange, mean_of
 from fhash_codec.progress import skip, stage, tell
-from fhash_formats.transform.encoding import OFFSETS
+from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 BINS = 4096

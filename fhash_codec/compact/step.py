@@ -24,7 +24,7 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome
 from fhash_formats.errors import InputError
-from fhash_formats.transform.encoding import (
+from fhash_formats.transform.tile import (
     OFFSETS,
     TRELLIS_WEIGHT,
     WEIGHT,

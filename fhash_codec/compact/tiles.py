@@ -20,9 +20,8 @@ from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.threads import chunk_region, map_ahead, one_ahead, usable_threads
-from fhash_formats.transform import encoding
-from fhash_formats.transform.decoding import decode_tile
-from fhash_formats.transform.encoding import WEIGHT, CodedTile, encode_tile, exact_tile
+from fhash_formats.transform import tile as coder
+from fhash_formats.transform.tile import WEIGHT, CodedTile, decode_tile, encode_tile, exact_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings
 from fhash_formats.transform.values import about_origin, cast
 
@@ -316,7 +315,7 @@ class BulkPart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coding(encoding.Coding):
+class Coding(coder.Coding):
     """Options of the encoder for the tiles of a series.
 
     They change the bytes, but a decoder does not need them. What a decoder needs is in

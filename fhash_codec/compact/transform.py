@@ -20,9 +20,8 @@ from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Out
 from fhash_codec.measure.errors import BULK_SHARE, pointer
 from fhash_codec.progress import stage
 from fhash_formats.transform.coder import checked
-from fhash_formats.transform.decoding import transform_for
-from fhash_formats.transform.encoding import plain_step
 from fhash_formats.transform.spec import MAX_LENGTH, AxisTransform, Basis, TransformSpec, fit_basis
+from fhash_formats.transform.tile import forward, plain_step
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 Gram = npt.NDArray[np.float64]
@@ -707,14 +706,14 @@ def _tile_magnitudes(
 ) -> list[Magnitudes]:
     """Return the magnitudes of the coefficients of some tiles; of all, in C order, if None."""
     # Only the kinds of the transform matter; float32 is precise enough.
-    transform = transform_for(replace(settings, double=False, step=1.0), blocks.tile)
+    kinds = replace(settings, double=False, step=1.0)
 
     def tile_magnitudes(index: Index) -> Magnitudes:
         with np.errstate(over="ignore", invalid="ignore"):
             values = blocks.read(index).values.astype(np.float32)
             values -= np.float32(settings.center)
             values[~np.isfinite(values)] = 0
-            return magnitudes(transform.forward(values))
+            return magnitudes(forward(values, kinds))
 
     return list(workers.map(tile_magnitudes, blocks.indices() if indices is None else indices))
 

@@ -51,7 +51,7 @@ from fhash_codec.progress import recording, silent
 from fhash_formats.errors import FhashWarning, QualityError
 from fhash_formats.series import ArraySeries, Series
 from fhash_formats.support.threads import usable_threads
-from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.tile import decode_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 OVERHEAD_BYTES = 2000

@@ -40,7 +40,7 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.container.array import transform_codecs
 from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.transform.encoding import OFFSETS, WEIGHT
+from fhash_formats.transform.tile import OFFSETS, WEIGHT
 from fhash_formats.transform.tile_format import TileSettings
 
 MIN_IMPORTANCE = 1e-4

@@ -29,9 +29,8 @@ from fhash_formats.container.header import LAYERS, MASK_ARRAY, MASK_FEATURES
 from fhash_formats.container.stored import ChunkCache
 from fhash_formats.support.arrays import Mask, Single
 from fhash_formats.support.threads import chunk_region
-from fhash_formats.transform.decoding import decode_tile
-from fhash_formats.transform.encoding import WEIGHT, Coding, encode_tile
 from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.tile import WEIGHT, Coding, decode_tile, encode_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 Region = tuple[slice, ...]

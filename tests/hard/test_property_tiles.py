@@ -28,8 +28,8 @@ from fhash_formats.transform.coder import (
     encode_labels,
     single_band,
 )
-from fhash_formats.transform.decoding import decode_tile, decode_tile_mask
-from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.tile import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.lifting import Transform, band_table
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
 from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec, fit_basis

@@ -22,8 +22,8 @@ from fhash_codec.selftest.run import cases
 from fhash_formats.container.reader import Container
 from fhash_formats.transform.chunk import encode_chunk
 from fhash_formats.transform.coder import MaskLevels, encode_block
-from fhash_formats.transform.decoding import decode_tile_mask
-from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.tile import decode_tile_mask
+from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.predict import encode_differences, encode_predicted
 from fhash_formats.transform.stream import ArrayAxes
 from fhash_formats.transform.tile_format import DIFFERENCES, TileSettings, seal

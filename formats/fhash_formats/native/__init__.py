@@ -70,13 +70,26 @@ _TILE = (ARRAY, ARRAY)
 """Context and tile."""
 _STREAM = (*_TILE, ARRAY, ctypes.c_size_t)
 
-PROTOTYPES: Prototypes = {
-    # fhash.h and part.cpp
+_TILES: Prototypes = {
     "fhash_context_create": (ctypes.c_uint64, ctypes.c_int32),
     "fhash_tile_decode": (*_STREAM, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
     "fhash_tile_table": (*_STREAM, ctypes.c_int32, *(ARRAY,) * 4),
     "fhash_tile_uncorrected": (*_STREAM, *(ARRAY,) * 4),
     "fhash_tile_part": (*_TILE, *(ARRAY,) * 4),
+    "fhash_tile_fill": (*_TILE, ARRAY, ARRAY, ctypes.c_int32, ARRAY, ARRAY),
+    "fhash_tile_forward": (*_TILE, *(ARRAY,) * 3),
+    "fhash_tile_foretell": (*_TILE, ARRAY, REAL, REAL, ARRAY, ARRAY),
+    "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
+    "fhash_tile_free": (ARRAY,),
+    "fhash_tile_bound": (ARRAY,),
+    "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),
+}
+"""Functions of fhash.h, chunk.cpp and part.cpp, whose result is an int32."""
+_RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.c_size_t}
+"""Other results."""
+
+PROTOTYPES: Prototypes = {
+    **_TILES,
     # coder.cpp
     "fhash_encode": (
         ARRAY,
@@ -213,6 +226,4 @@ def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: 
 def _declare(loaded: ctypes.CDLL, name: str, arguments: tuple[Any, ...]) -> None:
     function = getattr(loaded, name)
     function.argtypes = arguments
-    # Those of fhash.h have other results than the kernels.
-    tile = ctypes.c_int32 if name.startswith("fhash_tile_") else ctypes.c_int64
-    function.restype = ctypes.c_void_p if name == "fhash_context_create" else tile
+    function.restype = _RESULTS.get(name, ctypes.c_int32 if name in _TILES else ctypes.c_int64)

@@ -77,7 +77,9 @@ struct Taps {
     std::vector<int32_t>& all;
 
     void add(int lattice, int a, int by) { add(lattice, a, by, a, by); }
-    void add(int lattice, int a, int by, int b, int other) { add(lattice, a, by, b, other, b, other); }
+    void add(int lattice, int a, int by, int b, int other) {
+        add(lattice, a, by, b, other, b, other);
+    }
     void add(int lattice, int a, int by, int b, int other, int c, int third) {
         int32_t tap[5] = {lattice, 0, 0, 0, 0};
         tap[1 + a] = by;

@@ -1,5 +1,4 @@
 // The public functions on tiles (fhash.h), and those that Python calls beside them.
-#define FHASH_BUILDING
 #include "fhash.h"
 
 #include <new>

@@ -104,6 +104,8 @@ typedef struct fhash_quality {
     double max_error_rel; /* the same as a share of the range of the tile's values; 0 for none */
     double step;          /* step of the quantiser, without a bound; 0 for none */
     int32_t effort;       /* 1, the fastest, to 9 */
+    int32_t transform_given; /* 0: the transform that codes best in a trial; 1: `transform` */
+    uint8_t transform[4]; /* along t, z, y, x: 0 for none, else 16 (Haar), 32 (5/3) or 48 (9/7) plus levels, 1 to 10 */
     int32_t reserved;     /* 0 */
 } fhash_quality;
 

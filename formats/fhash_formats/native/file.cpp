@@ -1,5 +1,4 @@
 // Files (fhash.h): opening, header, variables and coordinates.
-#define FHASH_BUILDING
 #include <cmath>
 #include <cstdlib>
 #include <cstring>

@@ -70,7 +70,38 @@ std::int64_t fhash_head_apply(const float*, const std::int64_t*, std::int64_t, s
                               std::int64_t, const std::int64_t*, const float*, const float*,
                               const float*, const float*, std::int64_t, std::int64_t, float*);
 
-// quantise.cpp, values.cpp
+// quantise.cpp, trellis.cpp, values.cpp
+#define FHASH_TRELLIS_TABLE const std::int64_t*, const std::int32_t*, std::int64_t
+std::int64_t fhash_trellis_count(const std::int32_t*, FHASH_TRELLIS_TABLE, std::uint8_t*,
+                                 std::int64_t*);
+std::int64_t fhash_trellis_guess_f32(const float*, FHASH_TRELLIS_TABLE, std::uint8_t*,
+                                     std::int64_t*);
+std::int64_t fhash_trellis_guess_f64(const double*, FHASH_TRELLIS_TABLE, std::uint8_t*,
+                                     std::int64_t*);
+std::int64_t fhash_trellis_choose_f32(const float*, FHASH_TRELLIS_TABLE, const std::uint8_t*,
+                                      const std::int32_t*, std::int32_t*);
+std::int64_t fhash_trellis_choose_f64(const double*, FHASH_TRELLIS_TABLE, const std::uint8_t*,
+                                      const std::int32_t*, std::int32_t*);
+std::int64_t fhash_quantise_f32(const float*, std::int64_t, double, double, double, std::int32_t*,
+                                float*);
+std::int64_t fhash_quantise_f64(const double*, std::int64_t, double, double, double,
+                                std::int32_t*, float*);
+std::int64_t fhash_within_f32(const float*, const float*, const std::uint8_t*, std::int64_t,
+                              double);
+std::int64_t fhash_within_f64(const double*, const double*, const std::uint8_t*, std::int64_t,
+                              double);
+std::int64_t fhash_free_f32(float*, const float*, const std::uint8_t*, std::int64_t, double,
+                            double);
+std::int64_t fhash_free_f64(double*, const double*, const std::uint8_t*, std::int64_t, double,
+                            double);
+std::int64_t fhash_residual_f32_f32(const float*, const float*, const std::uint8_t*, std::int64_t,
+                                    double, double, std::int32_t*);
+std::int64_t fhash_residual_f32_f64(const float*, const double*, const std::uint8_t*, std::int64_t,
+                                    double, double, std::int32_t*);
+std::int64_t fhash_residual_f64_f32(const double*, const float*, const std::uint8_t*, std::int64_t,
+                                    double, double, std::int32_t*);
+std::int64_t fhash_residual_f64_f64(const double*, const double*, const std::uint8_t*,
+                                    std::int64_t, double, double, std::int32_t*);
 std::int64_t fhash_dequantise_f32(const std::int32_t*, std::int64_t, double, const double*, float*);
 std::int64_t fhash_dequantise_f64(const std::int32_t*, std::int64_t, double, const double*,
                                   double*);
@@ -89,6 +120,13 @@ std::int64_t fhash_correct_f64_f64(const double*, const std::int32_t*, std::int6
 namespace fhash {
 
 #define FHASH_OVERLOADS(T, NAME) \
+    inline std::int64_t transform_forward(const T* in, T* out, const std::int64_t* shape, \
+                                          const std::int64_t* kinds, const std::int64_t* depths, \
+                                          const std::int64_t* ranks, const T* const* matrices, \
+                                          const T* tz, const T* yx) { \
+        return fhash_transform_forward_##NAME(in, out, shape, kinds, depths, ranks, matrices, tz, \
+                                              yx); \
+    } \
     inline std::int64_t transform_inverse(const T* in, T* out, const std::int64_t* shape, \
                                           const std::int64_t* kinds, const std::int64_t* depths, \
                                           const std::int64_t* ranks, const T* const* matrices, \
@@ -106,6 +144,29 @@ namespace fhash {
     inline void dequantise(const std::int32_t* in, std::int64_t n, double step, \
                            const double* shifts, T* out) { \
         fhash_dequantise_##NAME(in, n, step, shifts, out); \
+    } \
+    inline void quantise(const T* in, std::int64_t n, double scale, double rounding, \
+                         double largest, std::int32_t* out, float* scaled) { \
+        fhash_quantise_##NAME(in, n, scale, rounding, largest, out, scaled); \
+    } \
+    inline std::int64_t guess_path(const T* scaled, const std::int64_t* shape, \
+                                   const std::int32_t* table, std::int64_t count, \
+                                   std::uint8_t* buckets, std::int64_t* counts) { \
+        return fhash_trellis_guess_##NAME(scaled, shape, table, count, buckets, counts); \
+    } \
+    inline std::int64_t choose_path(const T* scaled, const std::int64_t* shape, \
+                                    const std::int32_t* table, std::int64_t count, \
+                                    const std::uint8_t* buckets, const std::int32_t* rates, \
+                                    std::int32_t* levels) { \
+        return fhash_trellis_choose_##NAME(scaled, shape, table, count, buckets, rates, levels); \
+    } \
+    inline bool all_within(const T* values, const T* decoded, const std::uint8_t* counted, \
+                           std::int64_t n, double error) { \
+        return fhash_within_##NAME(values, decoded, counted, n, error) != 0; \
+    } \
+    inline std::int64_t free_values(T* target, const T* rebuilt, const std::uint8_t* counted, \
+                                    std::int64_t n, double low, double high) { \
+        return fhash_free_##NAME(target, rebuilt, counted, n, low, high); \
     } \
     inline void clip_shifted(T* values, std::int64_t n, double center, double low, double high) { \
         fhash_clip_##NAME(values, n, center, low, high); \
@@ -137,5 +198,17 @@ inline void correct(const double* base, const std::int32_t* rest, std::int64_t n
                     double* out) {
     fhash_correct_f64_f64(base, rest, n, quantum, out);
 }
+
+#define FHASH_RESIDUAL(V, B, NAME) \
+    inline std::int64_t residual_of(const V* values, const B* base, const std::uint8_t* counted, \
+                                    std::int64_t n, double quantum, double largest, \
+                                    std::int32_t* out) { \
+        return fhash_residual_##NAME(values, base, counted, n, quantum, largest, out); \
+    }
+FHASH_RESIDUAL(float, float, f32_f32)
+FHASH_RESIDUAL(float, double, f32_f64)
+FHASH_RESIDUAL(double, float, f64_f32)
+FHASH_RESIDUAL(double, double, f64_f64)
+#undef FHASH_RESIDUAL
 
 }  // namespace fhash

@@ -1,10 +1,10 @@
-// What Python asks of a tile beside its values: its table, and parts of it (transform/decoding.py).
-#define FHASH_BUILDING
+// What Python asks of a tile beside its stream and its values: its table, parts of it, and what a
+// search for settings tries (transform/tile.py).
 #include <cmath>
 
 #include "core.hpp"
-#include "numbers.hpp"
-#include "tile.hpp"
+#include "encode.hpp"
+#include "priors.hpp"
 
 namespace fhash {
 namespace {
@@ -74,10 +74,90 @@ template <class T> bool table_of(Job& job, T* values, fhash_error& error) {
     });
 }
 
+// Calls `work` with the settings and the shape of a tile.
+template <class Work>
+bool with_settings(fhash_context* context, const fhash_tile* tile, fhash_error& error, Work work) {
+    const auto settings =
+        unpack_settings(*context, (const uint8_t*)tile->settings, tile->settings_size, error);
+    if (!settings) return false;
+    if (!is_shape(tile->shape))
+        return fail(error, FHASH_ERROR_ARGUMENT, "a tile has four lengths");
+    Shape shape;
+    std::copy_n(tile->shape, 4, shape.begin());
+    return work(settings, shape);
+}
+
+template <class T>
+bool fill(fhash_context& context, const Settings& settings, const Shape& shape,
+          const uint8_t* counted, const uint8_t* finite, int density, T* values,
+          fhash_error& error) {
+    std::shared_ptr<Search<T>> search;
+    std::vector<T> target(values, values + vertices(shape));
+    if (!make_search(context, settings, shape, search, error) ||
+        !fill_uncounted(*search, counted, finite, density, target, error))
+        return false;
+    std::copy(target.begin(), target.end(), values);
+    return true;
+}
+
+template <class T>
+bool forward(fhash_context& context, const Settings& settings, const Shape& shape, const T* values,
+             T* out, fhash_error& error) {
+    const auto plan = forward_plan<T>(context, settings, shape, error);
+    return plan && kernel_done(plan->transform(values, out), "a transform", error);
+}
+
 }  // namespace
 }  // namespace fhash
 
 using namespace fhash;
+
+// Fill values of a tile in the working type, where it is not counted, in place (fill_uncounted).
+FHASH_EXPORT int32_t fhash_tile_fill(fhash_context* context, const fhash_tile* tile,
+                                     const uint8_t* counted, const uint8_t* finite,
+                                     int32_t density, void* values, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
+            return settings->real64 ? fill(*context, *settings, shape, counted, finite, density,
+                                           (double*)values, failed)
+                                    : fill(*context, *settings, shape, counted, finite, density,
+                                           (float*)values, failed);
+        });
+    });
+}
+
+// Coefficients of a tile in the working type, low bands first.
+FHASH_EXPORT int32_t fhash_tile_forward(fhash_context* context, const fhash_tile* tile,
+                                        const void* values, void* out, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
+            return settings->real64 ? forward(*context, *settings, shape, (const double*)values,
+                                              (double*)out, failed)
+                                    : forward(*context, *settings, shape, (const float*)values,
+                                              (float*)out, failed);
+        });
+    });
+}
+
+// The bytes that the fast coder would take for coefficients, and the sum of squared errors in
+// squared steps: results. scale: 1 / quantiser step. weight: squared steps that a bit is worth.
+FHASH_EXPORT int32_t fhash_tile_foretell(fhash_context* context, const fhash_tile* tile,
+                                         const float* coefficients, double scale, double weight,
+                                         double* results, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
+            const auto plan = plan_for<float>(*context, *settings, shape, 0, failed);
+            if (!plan) return false;
+            const FastPrior& prior = fast_prior();
+            const int64_t bands = (int64_t)plan->table.size() / TABLE_COLUMNS;
+            return kernel_done(fhash_fast_encode(nullptr, coefficients, 0, scale, weight,
+                                                 shape.data(), plan->table.data(), bands,
+                                                 prior.slots.data(), prior.defaults.data(),
+                                                 nullptr, 0, results),
+                               "the fast coder", failed);
+        });
+    });
+}
 
 // The table of a tile less its origin: see decode_tile_table.
 //

@@ -275,17 +275,62 @@ double gain_of(int kind, int64_t n, int levels) {
     return gain;
 }
 
-template <class T> void add_matrix(const AxisTransform& axis, int number, Plan<T>& plan) {
+// (S^T S)^-1 S^T of a basis S, (rank, n), which gives the least-squares coefficients of a column; by
+// elimination in a fixed order. False where S is nearly singular.
+bool analysis_of(const Basis& basis, std::vector<double>& result) {
+    const int64_t n = basis.n, rank = basis.rank;
+    const auto vector = [&](int64_t i, int64_t r) {
+        return (double)basis.synthesis[(size_t)(i * rank + r)];
+    };
+    std::vector<double> gram((size_t)(rank * rank), 0.0);
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t r = 0; r < rank; r++)
+            for (int64_t c = 0; c < rank; c++)
+                gram[(size_t)(r * rank + c)] += vector(i, r) * vector(i, c);
+    result.resize((size_t)(rank * n));
+    for (int64_t r = 0; r < rank; r++)
+        for (int64_t i = 0; i < n; i++) result[(size_t)(r * n + i)] = vector(i, r);
+    std::vector<double> left = gram;
+    const auto subtract = [](double* row, const double* other, double ratio, int64_t count) {
+        for (int64_t i = 0; i < count; i++) row[i] -= ratio * other[i];
+    };
+    for (int64_t k = 0; k < rank; k++) {
+        const double pivot = left[(size_t)(k * rank + k)];
+        if (!(pivot > 1e-9 * gram[(size_t)(k * rank + k)])) return false;
+        for (int64_t r = k + 1; r < rank; r++) {
+            const double ratio = left[(size_t)(r * rank + k)] / pivot;
+            subtract(&left[(size_t)(r * rank)], &left[(size_t)(k * rank)], ratio, rank);
+            subtract(&result[(size_t)(r * n)], &result[(size_t)(k * n)], ratio, n);
+        }
+    }
+    for (int64_t k = rank; k-- > 0;) {
+        for (int64_t i = 0; i < n; i++)
+            result[(size_t)(k * n + i)] /= left[(size_t)(k * rank + k)];
+        for (int64_t r = 0; r < k; r++)
+            subtract(&result[(size_t)(r * n)], &result[(size_t)(k * n)],
+                     left[(size_t)(r * rank + k)], n);
+    }
+    return true;
+}
+
+// The matrix of an axis with a basis, as the kernel takes it: along x transposed, so that its rows
+// lie along the results.
+template <class T> bool add_matrix(const AxisTransform& axis, int number, Plan<T>& plan) {
     const Basis& basis = *axis.basis;
+    int64_t rows = basis.n, columns = basis.rank;
+    std::vector<double> wide(basis.synthesis.begin(), basis.synthesis.end());
+    if (plan.lod == FORWARD) {
+        if (!analysis_of(basis, wide)) return false;
+        std::swap(rows, columns);
+    }
     plan.ranks[number] = basis.rank;
     auto& matrix = plan.matrices[number];
-    matrix.assign(basis.synthesis.begin(), basis.synthesis.end());
+    matrix.assign(wide.begin(), wide.end());
     if (matrix.empty()) matrix.push_back(0);  // the kernel asks for an address
-    if (number != 3) return;
-    // Along x transposed, so that its rows lie along the results.
-    for (int64_t i = 0; i < basis.n; i++)
-        for (int64_t r = 0; r < basis.rank; r++)
-            matrix[(size_t)(r * basis.n + i)] = (T)basis.synthesis[(size_t)(i * basis.rank + r)];
+    for (int64_t r = 0; number == 3 && r < rows; r++)
+        for (int64_t c = 0; c < columns; c++)
+            matrix[(size_t)(c * rows + r)] = (T)wide[(size_t)(r * columns + c)];
+    return true;
 }
 
 template <class T>
@@ -295,27 +340,29 @@ std::shared_ptr<const Plan<T>> make_plan(fhash_context& context, const Settings&
     plan->table = band_table(settings.axes, shape);
     plan->shape = shape;
     plan->lod = lod;
+    const int less = std::max(lod, 0);
     double gains[4];
     for (int a = 0; a < 4; a++) {
         const AxisTransform& axis = settings.axes[a];
         const int64_t n = shape[(size_t)a];
-        const int left_out = a ? std::min(lod, axis.depth) : 0;
+        const int left_out = a ? std::min(less, axis.depth) : 0;
         plan->bands[(size_t)a] = band_lengths(n, left_out).back();
         plan->depths[a] = axis.depth - left_out;
         plan->kinds[a] = axis.wavelet() && !plan->depths[a] ? NONE_KIND : axis.kind;
         plan->ranks[a] = 0;
-        plan->halvings[a] = a ? lod - left_out : 0;
+        plan->halvings[a] = a ? less - left_out : 0;
         gains[a] = gain_of(axis.kind, n, left_out);
-        if (axis.basis) add_matrix(axis, a, *plan);
+        if (axis.basis && !add_matrix(axis, a, *plan)) return nullptr;
     }
     const Norms norms = norms_of(context, settings.axes, shape);
+    const auto factor = [&](double norm) { return (T)(lod == FORWARD ? norm : 1.0 / norm); };
     for (int64_t t = 0; t < plan->bands[0]; t++)
         for (int64_t z = 0; z < plan->bands[1]; z++)
-            plan->tz.push_back((T)(1.0 / (norms.tz[(size_t)(t * shape[1] + z)] * gains[1])));
+            plan->tz.push_back(factor(norms.tz[(size_t)(t * shape[1] + z)] * gains[1]));
     for (int64_t y = 0; y < plan->bands[2]; y++)
         for (int64_t x = 0; x < plan->bands[3]; x++)
             plan->yx.push_back(
-                (T)(1.0 / (norms.yx[(size_t)(y * shape[3] + x)] * (gains[2] * gains[3]))));
+                factor(norms.yx[(size_t)(y * shape[3] + x)] * (gains[2] * gains[3])));
     return plan;
 }
 
@@ -363,8 +410,8 @@ Table band_table(const AxisTransform* axes, const Shape& shape) {
     Spans spans[4];
     for (int a = 0; a < 4; a++) spans[a] = spans_of(axes[a], shape[(size_t)a]);
     const bool coupled = is_coupled(axes[2], axes[3]);
-    Bands bands = {spans[2], spans[3], coupled, axes[2].kind == KLT_KIND || axes[3].kind == KLT_KIND,
-                   {}, {}};
+    const bool klt = axes[2].kind == KLT_KIND || axes[3].kind == KLT_KIND;
+    Bands bands = {spans[2], spans[3], coupled, klt, {}, {}};
     std::vector<Plane> planes;
     if (coupled) {
         planes = coupled_planes(spans[2], spans[3]);
@@ -408,6 +455,23 @@ int64_t Plan<T>::rebuild(const int32_t* integers, T* out, const double* numbers)
                        numbers);
 }
 
+template <class T> int64_t Plan<T>::transform(const T* values, T* out) const {
+    const T* of[4];
+    for (int a = 0; a < 4; a++) of[a] = matrices[a].empty() ? nullptr : matrices[a].data();
+    return transform_forward(values, out, shape.data(), kinds, depths, ranks, of, tz.data(),
+                             yx.data());
+}
+
+template <class T>
+std::shared_ptr<const Plan<T>> forward_plan(fhash_context& context, const Settings& settings,
+                                            const Shape& shape, fhash_error& error) {
+    const auto plan = plan_for<T>(context, settings, shape, FORWARD, error);
+    if (!plan && error.status != FHASH_ERROR_DAMAGED)
+        fail(error, FHASH_ERROR_ARGUMENT,
+             "the vectors of a basis depend on each other, so nothing can be encoded with it");
+    return plan;
+}
+
 template <class T>
 std::shared_ptr<const Plan<T>> plan_for(fhash_context& context, const Settings& settings,
                                         const Shape& shape, int lod, fhash_error& error) {
@@ -428,6 +492,7 @@ std::shared_ptr<const Plan<T>> plan_for(fhash_context& context, const Settings& 
             if (plan->shape == shape && plan->lod == lod) return plan;
     }
     const auto plan = make_plan<T>(context, settings, shape, lod);
+    if (!plan) return nullptr;
     const Guard guard(settings.lock);
     if (plans.size() == REMEMBERED) plans.erase(plans.begin());
     plans.push_back(plan);
@@ -469,6 +534,10 @@ template std::shared_ptr<const Plan<float>> plan_for(fhash_context&, const Setti
                                                      const Shape&, int, fhash_error&);
 template std::shared_ptr<const Plan<double>> plan_for(fhash_context&, const Settings&,
                                                       const Shape&, int, fhash_error&);
+template std::shared_ptr<const Plan<float>> forward_plan(fhash_context&, const Settings&,
+                                                         const Shape&, fhash_error&);
+template std::shared_ptr<const Plan<double>> forward_plan(fhash_context&, const Settings&,
+                                                          const Shape&, fhash_error&);
 template bool linear_values(const Settings&, const Plan<float>&, int32_t*, float*, fhash_error&);
 template bool linear_values(const Settings&, const Plan<double>&, int32_t*, double*, fhash_error&);
 

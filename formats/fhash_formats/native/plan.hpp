@@ -1,11 +1,11 @@
-// Inverse transform of tiles of one shape: the factors of the norms, and the run of the kernel.
+// Transform of tiles of one shape: bands, the factors of the norms, and the runs of the kernels.
 #pragma once
 
 #include "coding.hpp"
 
 namespace fhash {
 
-constexpr int MAX_LOD = 10;
+constexpr int MAX_LOD = 10, FORWARD = -1;
 
 // Norms along two axes together, as two factors: (t, z) and (y, x).
 struct Norms {
@@ -22,13 +22,15 @@ inline Shape lod_shape(const Shape& shape, int lod) {
 
 template <class T> struct Plan {
     Shape shape, bands;  // of the tile, and of the coefficients that the level of detail needs
-    int lod;
+    int lod;  // FORWARD for a plan of the forward transform
     Table table;
     int64_t kinds[4], depths[4], ranks[4];
     std::vector<T> matrices[4];
     std::vector<T> tz, yx;
     int halvings[4];  // by a filter, where an axis has not so many levels
 
+    // Coefficients from values, only of a plan of the forward transform.
+    int64_t transform(const T* values, T* out) const;
     // Values from coefficients (of `bands`, contiguous) by the kernel; `out` has the same shape.
     int64_t invert(const T* coefficients, T* out) const;
     // Values from integers in one run; numbers as in lifting.cpp. Only without a level of detail.
@@ -39,6 +41,11 @@ template <class T> struct Plan {
 template <class T>
 std::shared_ptr<const Plan<T>> plan_for(fhash_context& context, const Settings& settings,
                                         const Shape& shape, int lod, fhash_error& error);
+
+// The plan of the forward transform; null where a basis does not fit, or cannot encode.
+template <class T>
+std::shared_ptr<const Plan<T>> forward_plan(fhash_context& context, const Settings& settings,
+                                            const Shape& shape, fhash_error& error);
 
 // Values of a tile before head and residual, in the working type and clipped to the range.
 //

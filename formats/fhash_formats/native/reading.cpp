@@ -1,5 +1,4 @@
 // fhash_read: values of a region at a step, or between two steps.
-#define FHASH_BUILDING
 #include <algorithm>
 #include <cmath>
 #include <cstring>

@@ -31,7 +31,8 @@ bool Bytes::leb(uint64_t& value) {
 
 namespace {
 
-constexpr int DOUBLE = 1, CLIP = 2, TRELLIS = 8, WHOLE = 16, HEAD = 32, MASK = 64, PREDICTOR = 128;
+constexpr int DOUBLE = 1, CLIP = 2, LABELS = 4, TRELLIS = 8;
+constexpr int WHOLE = 16, HEAD = 32, MASK = 64, PREDICTOR = 128;
 constexpr int64_t MAX_LENGTH = 512;  // longest axis that may have a basis of its own
 constexpr int MAX_EXPONENT = 24, MAX_DEPTH = 10;
 constexpr int MAX_WEIGHT = 31;       // of a head
@@ -423,11 +424,13 @@ bool read_numbers(Bytes& data, Settings& settings, fhash_error& error) {
 }
 
 bool unpack(Bytes data, Settings& settings, fhash_error& error) {
+    settings.packed.assign(data.at, data.end);
     const uint8_t* first;
     if (!data.take(5, first)) return cut(error);
     const int flags = first[0];
     settings.real64 = flags & DOUBLE;
     settings.clip = flags & CLIP;
+    settings.labels = flags & LABELS;
     settings.trellis = flags & TRELLIS;
     settings.whole = flags & WHOLE;
     if (!read_numbers(data, settings, error) || !read_axes(data, first + 1, settings, error))

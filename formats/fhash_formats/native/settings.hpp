@@ -71,7 +71,8 @@ struct Settings {
     int64_t whole_low = 0, whole_high = 0;
     Wide origin;
     int8_t offsets[OFFSET_COUNT];
-    bool real64, clip, trellis;       // real64: the arithmetic is in float64
+    bool real64, clip, labels, trellis;  // real64: the arithmetic is in float64
+    std::vector<uint8_t> packed;
     std::unique_ptr<Head> head;
     std::unique_ptr<MaskScores> mask;
     std::unique_ptr<Predictor> predictor;

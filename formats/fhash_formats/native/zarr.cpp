@@ -298,13 +298,47 @@ bool place_chunks(const Directory& directory, Hierarchy& found, fhash_error& err
         if (!make_room(each.second, counts[each.first], error)) return false;
     for (uint32_t number = 0; number < directory.members.size(); number++) {
         const Member& member = directory.members[number];
-        const size_t slash = member.name.rfind('/');
-        if (member.name.substr(slash == std::string::npos ? 0 : slash + 1) == "zarr.json") continue;
+        if (is_document(member.name)) continue;
         if (!is_chunk(member) || !place_member(found.arrays[path], index, number))
             return fail(error, FHASH_ERROR_DAMAGED, "member %s belongs to no array",
                         member.name.c_str());
     }
     return true;
+}
+
+// The end of a JSON value, of text that was parsed before.
+const char* skip_value(const char* at) {
+    int depth = 0;
+    do {
+        if (*at == '"') {
+            for (at++; *at != '"'; at++) at += *at == '\\';
+        } else if (*at == '{' || *at == '[') {
+            depth++;
+        } else if (*at == '}' || *at == ']') {
+            depth--;
+        }
+        at++;
+    } while (depth > 0 || (at[-1] != '"' && at[-1] != '}' && at[-1] != ']' &&
+                           *at != ',' && *at != '}' && *at != ']'));
+    return at;
+}
+
+// The texts of the values of an object by their keys, where nothing stands between tokens.
+std::map<std::string, std::string> value_texts(const std::string& object) {
+    std::map<std::string, std::string> found;
+    if (object.size() < 3 || object[1] != '"') return found;
+    const char* at = object.c_str() + 1;
+    while (*at == '"') {
+        const char* const key = at + 1;
+        at = skip_value(at);
+        const std::string name(key, at - 1);
+        if (*at != ':') break;
+        const char* const value = at + 1;
+        at = skip_value(value);
+        found[name].assign(value, at);
+        if (*at == ',') at++;
+    }
+    return found;
 }
 
 // Reads the documents of all nodes, those that lie together at once.
@@ -314,13 +348,12 @@ struct Documents {
     std::map<std::string, Json> nodes;  // by path
     std::vector<JsonDocument>& kept;
 
-    bool add(const Member& member, const uint8_t* stored, fhash_error& error) {
-        Buffer text;
-        if (!open_member(member, stored, text, error)) return false;
-        JsonDocument document;
-        if (!parse_json(text.data(), text.size(), *source.context, document, error))
-            return fail_in(error, "member " + member.name);
-        const Json values = yyjson_doc_get_root(document.get());
+    static std::string path_of(const Member& member) {
+        const size_t slash = member.name.rfind('/');
+        return slash == std::string::npos ? "" : member.name.substr(0, slash);
+    }
+
+    bool add(const Member& member, Json values, fhash_error& error) {
         const Json type = yyjson_obj_get(values, "node_type");
         int64_t three = 0;
         bool good = is_whole(yyjson_obj_get(values, "zarr_format"), 3, 3, three) &&
@@ -331,11 +364,21 @@ struct Documents {
         const Json attributes = yyjson_obj_get(values, "attributes");
         if (good && attributes && !yyjson_is_obj(attributes))
             good = damaged(error, "attributes is not an object");
-        if (!good) return fail_in(error, "member " + member.name);
-        const size_t slash = member.name.rfind('/');
-        nodes[slash == std::string::npos ? "" : member.name.substr(0, slash)] = values;
-        kept.push_back(std::move(document));
-        return true;
+        nodes[path_of(member)] = values;
+        return good || fail_in(error, "member " + member.name);
+    }
+
+    // Parses a document from its local header, name and data. `text`: null, or gets the document.
+    bool parse(const Member& member, const uint8_t* stored, std::string* text,
+               fhash_error& error) {
+        Buffer bytes;
+        if (!open_member(member, stored, bytes, error)) return false;
+        JsonDocument document;
+        if (!parse_json(bytes.data(), bytes.size(), *source.context, document, error))
+            return fail_in(error, "member " + member.name);
+        if (text) text->assign(bytes.begin(), bytes.end());
+        kept.push_back(document);
+        return add(member, yyjson_doc_get_root(document.get()), error);
     }
 
     bool read_span(const std::vector<const Member*>& together, fhash_error& error) {
@@ -343,21 +386,54 @@ struct Documents {
         Buffer bytes;
         if (!source.read(start, together.back()->end() - start, bytes, error)) return false;
         for (const Member* member : together)
-            if (!add(*member, bytes.data() + (member->offset - start), error)) return false;
+            if (!parse(*member, bytes.data() + (member->offset - start), nullptr, error))
+                return false;
         return true;
+    }
+
+    // Takes documents from the root's copies of them, where these are the same byte by byte: the
+    // directory has their checksums. They need not be read.
+    bool take_copies(const std::string& root, fhash_error& error) {
+        const auto texts =
+            value_texts(value_texts(value_texts(root)["consolidated_metadata"])["metadata"]);
+        const Json copies = yyjson_obj_get(
+            yyjson_obj_get(nodes.at(""), "consolidated_metadata"), "metadata");
+        yyjson_obj_iter iter = yyjson_obj_iter_with(copies);
+        while (Json key = yyjson_obj_iter_next(&iter)) {
+            const std::string path = yyjson_get_str(key);
+            const Member* const member = directory.find(path + "/zarr.json");
+            const auto text = texts.find(path);
+            if (!member || text == texts.end()) continue;
+            const uint64_t size =
+                member->full_size < 0 ? member->size : uint64_t(member->full_size);
+            const uint8_t* const bytes = reinterpret_cast<const uint8_t*>(text->second.data());
+            if (size != text->second.size() || crc_32(bytes, size_t(size)) != member->crc) continue;
+            if (!add(*member, yyjson_obj_iter_get_val(key), error)) return false;
+        }
+        return true;
+    }
+
+    bool read_root(fhash_error& error) {
+        const Member* const member = directory.find("zarr.json");
+        if (!member) return damaged(error, "member zarr.json is missing");
+        Buffer bytes;
+        std::string text;
+        if (!source.read(member->offset, member->end() - member->offset, bytes, error) ||
+            !parse(*member, bytes.data(), &text, error))
+            return false;
+        return !yyjson_is_obj(yyjson_obj_get(nodes.at(""), "consolidated_metadata")) ||
+               take_copies(text, error);
     }
 
     bool read(fhash_error& error) {
         std::vector<const Member*> together;
         uint64_t total = 0;
+        if (!read_root(error)) return false;
         for (const Member& member : directory.members) {
-            const size_t slash = member.name.rfind('/');
-            const size_t start = slash == std::string::npos ? 0 : slash + 1;
-            if (member.name.compare(start, std::string::npos, "zarr.json")) continue;
+            if (!is_document(member.name) || nodes.count(path_of(member))) continue;
             total += member.full_size < 0 ? member.size : uint64_t(member.full_size);
-            if (member.size > MAX_DOCUMENT || !may_use(*source.context, total, error))
-                return member.size > MAX_DOCUMENT ? damaged(error, "metadata of over 2^24 bytes")
-                                                  : false;
+            if (member.size > MAX_DOCUMENT) return damaged(error, "metadata of over 2^24 bytes");
+            if (!may_use(*source.context, total, error)) return false;
             if (!together.empty() && (member.offset - together.back()->end() > GAP ||
                                       member.end() - together.front()->offset > MOST)) {
                 if (!read_span(together, error)) return false;
@@ -406,14 +482,12 @@ bool read_hierarchy(const Source& source, const Directory& directory, Hierarchy&
                     fhash_error& error) {
     Documents documents{source, directory, {}, found.documents};
     if (!documents.read(error)) return false;
-    const auto root = documents.nodes.find("");
-    if (root == documents.nodes.end()) return damaged(error, "member zarr.json is missing");
     const auto is_group = [&](const std::string& path) {
         const auto node = documents.nodes.find(path);
         return node != documents.nodes.end() &&
                is(yyjson_obj_get(node->second, "node_type"), "group");
     };
-    found.root = yyjson_obj_get(root->second, "attributes");
+    found.root = yyjson_obj_get(documents.nodes.at(""), "attributes");
     if (!is_group("") || !yyjson_is_obj(yyjson_obj_get(found.root, "fhash")))
         return damaged(error, "member zarr.json is not the group of an fhash container");
     if (!check_format(yyjson_obj_get(found.root, "fhash"), error)) return false;

@@ -159,13 +159,6 @@ bool is_name(const uint8_t* name, size_t size) {
     return !first;
 }
 
-bool is_document(const std::string& name) {
-    static const std::string DOCUMENT = "zarr.json";
-    const size_t start = name.rfind('/');
-    return name.compare(start == std::string::npos ? 0 : start + 1, std::string::npos, DOCUMENT) ==
-           0;
-}
-
 // The member whose entry begins at `at`, which it moves behind the entry. The entry must be the
 // one that a writer makes of the member.
 bool parse_entry(const uint8_t*& at, const uint8_t* stop, Member& member, fhash_error& error) {
@@ -259,6 +252,15 @@ bool Source::read(uint64_t offset, uint64_t length, Buffer& bytes, fhash_error& 
     return read(offset, length, bytes.data(), error);
 }
 
+bool is_document(const std::string& name) {
+    static const std::string DOCUMENT = "zarr.json";
+    const size_t start = name.rfind('/');
+    return name.compare(start == std::string::npos ? 0 : start + 1, std::string::npos, DOCUMENT) ==
+           0;
+}
+
+uint32_t crc_32(const uint8_t* data, size_t size) { return uint32_t(crc32_z(0, data, size)); }
+
 const Member* Directory::find(const std::string& name) const {
     const auto found = numbers.find(name);
     return found == numbers.end() ? nullptr : &members[found->second];
@@ -303,7 +305,7 @@ bool check_member(const Member& member, const uint8_t* stored, fhash_error& erro
         return fail(error, FHASH_ERROR_DAMAGED, "member %s: its header differs from the directory",
                     member.name.c_str());
     if (member.full_size < 0 &&
-        crc32_z(0, stored + header.size(), size_t(member.size)) != member.crc)
+        crc_32(stored + header.size(), size_t(member.size)) != member.crc)
         return fail(error, FHASH_ERROR_DAMAGED,
                     "member %s: its CRC-32 differs, the data are damaged", member.name.c_str());
     return true;
@@ -319,7 +321,7 @@ bool open_member(const Member& member, const uint8_t* stored, Buffer& data, fhas
     data.resize(size_t(member.full_size));
     if (!inflate_exact(start, size_t(member.size), false, data.data(), data.size(), error))
         return fail_in(error, "member " + member.name);
-    if (crc32_z(0, data.data(), data.size()) != member.crc)
+    if (crc_32(data.data(), data.size()) != member.crc)
         return fail(error, FHASH_ERROR_DAMAGED,
                     "member %s: its CRC-32 differs, the data are damaged", member.name.c_str());
     return true;

@@ -53,6 +53,11 @@ bool open_member(const Member& member, const uint8_t* stored, Buffer& data, fhas
 // The same, where the data are not deflated: they begin at data_offset() - offset.
 bool check_member(const Member& member, const uint8_t* stored, fhash_error& error);
 
+// Whether a member is a metadata document, by its name.
+bool is_document(const std::string& name);
+
+uint32_t crc_32(const uint8_t* data, size_t size);
+
 // SHA-256 of some bytes.
 void sha256(const uint8_t* data, size_t size, uint8_t digest[32]);
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -373,6 +373,14 @@ class TransformSpec:
         """Whether y and x form a pyramid: the same wavelet with the same depth."""
         y, x = self.axes[2:]
         return y.wavelet and (y.kind, y.depth) == (x.kind, x.depth)
+
+    def check(self, shape: Sequence[int]) -> None:
+        """Raises InputError for a basis of another length than its axis of a tile (t, z, y, x)."""
+        for name, axis, n in zip(AXES, self.axes, shape, strict=True):
+            if axis.basis is not None and axis.basis.n != n:
+                raise InputError(
+                    f"the basis along {name} is for {axis.basis.n} vertices, the tile has {n}"
+                )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by axis.

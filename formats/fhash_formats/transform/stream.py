@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
-from fhash_formats.transform.decoding import (
+from fhash_formats.transform.predict import encode_differences
+from fhash_formats.transform.tile import (
     corrected_region,
     decode_tile,
     decode_tile_mask,
     decode_tile_table,
     uncorrected,
 )
-from fhash_formats.transform.predict import encode_differences
 from fhash_formats.transform.tile_format import (
     DIFFERENCES,
     Shape,
@@ -181,7 +181,7 @@ class TransformCoder:
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk, which keeps every bit where there are no settings."""
-        from fhash_formats.transform.encoding import encode_tile  # which a decoder does without
+        from fhash_formats.transform.tile import encode_tile  # which a decoder does without
 
         tile = chunk.reshape(self._tile_shape) if self.axes is None else self.axes.to_tile(chunk)
         if self.settings is not None:

@@ -36,10 +36,9 @@ from fhash_formats.transform.chunk import (
     supported,
     tile_shape,
 )
-from fhash_formats.transform.decoding import decode_tile
-from fhash_formats.transform.encoding import encode_tile
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.stream import KEY, ArrayAxes, settings_of, take_axes
+from fhash_formats.transform.tile import decode_tile, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 
 if TYPE_CHECKING:

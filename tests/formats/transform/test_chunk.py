@@ -18,7 +18,7 @@ from tiles import SETTINGS, SHAPE, same, wave
 from fhash_formats.errors import DamagedFileError, FhashError, InputError, UnsupportedFileError
 from fhash_formats.transform.chunk import candidates, decode_chunk, encode_chunk, tile_shape
 from fhash_formats.transform.coder import MaskLevels
-from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.spec import (
     MAX_DEPTH,
     MAX_EXPONENT,

@@ -27,14 +27,14 @@ from fhash_formats.transform.coder import (
     encode_integers,
     single_band,
 )
-from fhash_formats.transform.decoding import (
+from fhash_formats.transform.tile import (
     corrected_region,
     decode_tile,
     decode_tile_mask,
     transform_for,
     uncorrected,
 )
-from fhash_formats.transform.encoding import (
+from fhash_formats.transform.tile import (
     BUCKETS,
     MAX_CHOSEN,
     RATES,

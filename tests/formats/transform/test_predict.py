@@ -22,8 +22,8 @@ from fhash_formats.native import crc32c
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform import predict
 from fhash_formats.transform.coder import MaskLevels, State, state_arguments
-from fhash_formats.transform.decoding import decode_tile, decode_tile_mask
-from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.tile import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.predict import (
     MAX_PREDICTED_INTEGER,
     Predictor,

@@ -20,7 +20,7 @@ from zarr.codecs.numcodecs import FixedScaleOffset
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform import values as elementwise
 from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.encoding import encode_tile
+from fhash_formats.transform.tile import encode_tile
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import (

@@ -27,7 +27,7 @@ from fhash_formats.transform.coder import (
     prior_state,
     single_band,
 )
-from fhash_formats.transform.encoding import choose_levels
+from fhash_formats.transform.tile import choose_levels
 from fhash_formats.transform.lifting import band_table
 from fhash_formats.transform.predict import (
     Predictor,

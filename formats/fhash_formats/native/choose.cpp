@@ -1,0 +1,340 @@
+// Choice of the integers of coefficients, and of values where a tile has none.
+#include <algorithm>
+#include <cmath>
+
+#include "encode.hpp"
+#include "kernels.hpp"
+#include "priors.hpp"
+
+namespace fhash {
+namespace {
+
+constexpr int BUCKETS = 64, RATES = 24;  // classes of indices, and indices with a rate of their own
+constexpr double COST = 32768;           // costs of a squared step
+constexpr double MAX_RATE_COST = 1 << 19;
+constexpr double SIGN_BITS = 0.85;       // of a sign, which contexts predict a little
+constexpr double NEIGHBOUR_SHARE = 0.3;  // of the counts of the next buckets in those of a bucket
+constexpr double PRIOR_COUNT = 8;        // observations that a geometric distribution stands for
+constexpr int64_t MAX_CHOSEN = 1 << 22;  // from which on an integer is the nearest one
+
+// A sum in the order in which numpy adds 24 numbers.
+double sum_of(const double* numbers) {
+    double lanes[8];
+    std::copy_n(numbers, 8, lanes);
+    for (int i = 8; i < RATES; i += 8)
+        for (int lane = 0; lane < 8; lane++) lanes[lane] += numbers[i + lane];
+    return ((lanes[0] + lanes[1]) + (lanes[2] + lanes[3])) +
+           ((lanes[4] + lanes[5]) + (lanes[6] + lanes[7]));
+}
+
+// The costs of the bits of indices (2, BUCKETS, RATES) from how often they come.
+std::vector<int32_t> rates_of(const std::vector<int64_t>& counts, double weight) {
+    std::vector<int32_t> rates;
+    rates.reserve(counts.size());
+    for (int row = 0; row < 2 * BUCKETS; row++) {
+        const int bucket = row % BUCKETS;
+        const int64_t* const own = &counts[(size_t)(row * RATES)];
+        double smooth[RATES], moments[RATES];
+        for (int i = 0; i < RATES; i++) {
+            smooth[i] = (double)own[i];
+            if (bucket > 0) smooth[i] += NEIGHBOUR_SHARE * (double)own[i - RATES];
+            if (bucket + 1 < BUCKETS) smooth[i] += NEIGHBOUR_SHARE * (double)own[i + RATES];
+            moments[i] = smooth[i] * i;
+        }
+        const double total = sum_of(smooth), mean = (sum_of(moments) + 0.02) / (total + 1);
+        const double share = mean / (1 + mean);
+        for (int i = 0; i < RATES; i++) {
+            const double chance =
+                (smooth[i] + PRIOR_COUNT * (1 - share) * std::pow(share, i)) /
+                (total + PRIOR_COUNT);
+            const double bits = -std::log2(std::max(chance, 1e-9)) + (i ? SIGN_BITS : 0.0);
+            rates.push_back(
+                (int32_t)std::min(std::nearbyint(bits * weight * COST), MAX_RATE_COST));
+        }
+    }
+    return rates;
+}
+
+// The integers of the cheapest path through the trellis, searched `passes` times.
+template <class T>
+bool choose_levels(const Search<T>& search, const std::vector<T>& scaled, double weight, int passes,
+                   std::vector<int32_t>& levels, fhash_error& error) {
+    const Table& table = search.table();
+    const int64_t bands = (int64_t)table.size() / TABLE_COLUMNS;
+    int64_t coded = 0;
+    for (int64_t band = 0; band < bands; band++) {
+        int64_t product = 1;
+        const int32_t* const row = &table[(size_t)(band * TABLE_COLUMNS)];
+        for (int a = 0; a < 4; a++) product *= row[4 + a] - row[a];
+        coded += product;
+    }
+    std::vector<uint8_t> buckets((size_t)coded);
+    for (int pass = 0; pass < std::max(passes, 1); pass++) {
+        std::vector<int64_t> counts(2 * BUCKETS * RATES, 0);
+        const int64_t* const shape = search.shape.data();
+        int64_t code = pass == 0 ? guess_path(scaled.data(), shape, table.data(), bands,
+                                              buckets.data(), counts.data())
+                                 : fhash_trellis_count(levels.data(), shape, table.data(), bands,
+                                                       buckets.data(), counts.data());
+        if (!kernel_done(code, "the trellis", error)) return false;
+        levels.assign(scaled.size(), 0);
+        code = choose_path(scaled.data(), shape, table.data(), bands, buckets.data(),
+                           rates_of(counts, weight).data(), levels.data());
+        if (!kernel_done(code, "the trellis", error)) return false;
+    }
+    return true;
+}
+
+// Coefficients in steps; false where one is too large for the trellis.
+template <class T>
+bool scale_all(const Search<T>& search, const std::vector<T>& coefficients,
+               std::vector<T>& scaled) {
+    const T unit = (T)(1.0 / search.settings.step);
+    bool small = true;
+    scaled.resize(coefficients.size());
+    for (size_t i = 0; i < scaled.size(); i++) {
+        scaled[i] = coefficients[i] * unit;
+        small &= std::fabs(scaled[i]) < (T)LARGEST;  // false for NaN as well
+    }
+    return small;
+}
+
+int64_t largest_of(const std::vector<int32_t>& integers) {
+    int64_t largest = 0;
+    for (const int32_t q : integers) largest = std::max(largest, std::abs((int64_t)q));
+    return largest;
+}
+
+template <class T>
+void quantise_all(const std::vector<T>& coefficients, double step, std::vector<int32_t>& integers,
+                  std::vector<float>& scaled) {
+    integers.resize(coefficients.size());
+    scaled.resize(coefficients.size());
+    quantise(coefficients.data(), (int64_t)coefficients.size(), 1.0 / step, ROUNDING, LARGEST,
+             integers.data(), scaled.data());
+}
+
+}  // namespace
+
+bool encode_integers(std::vector<int32_t>& integers, const Shape& shape, const Table& table,
+                     const IntegerCoding& how, Buffer& out, fhash_error& error) {
+    const int64_t bands = (int64_t)table.size() / TABLE_COLUMNS;
+    const std::vector<int32_t> given = integers;
+    // Each time the original integers: coding the chosen ones would give other bytes, because rows
+    // that became empty are signalled differently.
+    const auto encode = [&](uint8_t* data, int64_t capacity) -> int64_t {
+        if (how.fast) {
+            double results[2];
+            const FastPrior& prior = fast_prior();
+            if (how.scaled) std::fill(integers.begin(), integers.end(), 0);
+            return fhash_fast_encode(integers.data(), how.scaled, how.trellis, 1.0, how.weight,
+                                     shape.data(), table.data(), bands, prior.slots.data(),
+                                     prior.defaults.data(), data, capacity, results);
+        }
+        const State& prior = integer_prior(how.trellis);
+        integers = given;
+        // The state is not kept, so that nothing is written to the prior.
+        return fhash_encode(integers.data(), how.scaled, how.weight, how.trellis, shape.data(),
+                            table.data(), bands, const_cast<uint16_t*>(prior.slots.data()),
+                            prior.slot_count(), const_cast<int32_t*>(prior.weights.data()),
+                            (int64_t)prior.weights.size(),
+                            const_cast<uint16_t*>(prior.simples.data()), prior.simple_count(), 0,
+                            data, capacity);
+    };
+    return with_room((int64_t)integers.size() / 2, out, error, encode);
+}
+
+template <class T>
+bool make_search(fhash_context& context, const Settings& settings, const Shape& shape,
+                 std::shared_ptr<Search<T>>& search, fhash_error& error) {
+    search.reset(new Search<T>{context, settings, shape, nullptr, nullptr});
+    search->forward = forward_plan<T>(context, settings, shape, error);
+    if (search->forward) search->inverse = plan_for<T>(context, settings, shape, 0, error);
+    return search->inverse != nullptr;
+}
+
+template <class T>
+bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients, double weight,
+                     int passes, std::vector<int32_t>& integers, fhash_error& error) {
+    if (search.settings.trellis) {
+        std::vector<T> scaled;
+        return scale_all(search, coefficients, scaled) &&
+               choose_levels(search, scaled, weight, passes, integers, error);
+    }
+    std::vector<float> scaled;
+    quantise_all(coefficients, search.settings.step, integers, scaled);
+    if (weight <= 0) return true;
+    Buffer unused;
+    return encode_integers(integers, search.shape, search.table(),
+                           {false, false, scaled.data(), weight}, unused, error);
+}
+
+template <class T>
+bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficients,
+                       const fhash_coding& coding, Buffer& data, std::vector<int32_t>& integers,
+                       fhash_error& error) {
+    const Settings& settings = search.settings;
+    const bool fast = coding.fast;
+    const auto encode = [&](const IntegerCoding& how) {
+        return encode_integers(integers, search.shape, search.table(), how, data, error);
+    };
+    if (settings.trellis && fast) {
+        std::vector<T> scaled;
+        if (!scale_all(search, coefficients, scaled)) return false;
+        const std::vector<float> narrow(scaled.begin(), scaled.end());
+        integers.assign(coefficients.size(), 0);
+        return encode({true, true, narrow.data(), coding.weight});
+    }
+    if (settings.trellis)
+        return choose_integers(search, coefficients, coding.weight, coding.passes, integers,
+                               error) &&
+               encode({true, false, nullptr, 0});
+    std::vector<float> scaled;
+    quantise_all(coefficients, settings.step, integers, scaled);
+    const int64_t largest = largest_of(integers);
+    if ((double)largest >= LARGEST) return false;
+    const bool chooses = coding.weight > 0;
+    const std::vector<int32_t> nearest = integers;
+    if (!encode({false, fast, chooses ? scaled.data() : nullptr, coding.weight})) return false;
+    const bool mended = largest >= MAX_CHOSEN && chooses && settings.real64;
+    for (size_t i = 0; mended && i < integers.size(); i++)
+        if (std::abs((int64_t)nearest[i]) >= MAX_CHOSEN)
+            integers[i] = (int32_t)std::nearbyint(coefficients[i] / (T)settings.step);
+    if (!mended && !(coding.passes > 1 && chooses && !fast)) return true;
+    return encode({false, fast, nullptr, 0});
+}
+
+namespace {
+
+constexpr double HIGHEST = 64, LOWEST = 0.4;  // first and last threshold, in quantiser steps
+constexpr double NEARBY = 16;  // first one where the present values are a good filling already
+constexpr double MOMENTUM = 0.8;  // share of the last change that is added to the next guess
+constexpr int64_t FEW_BITS = 64;  // tiles of fewer are not searched with more thresholds
+
+// Ratio of a threshold to the one before it, by the number of thresholds per factor of two.
+double ratio_of(int density) {
+    return density == 2   ? 0.7071067811865476
+           : density == 4 ? 0.8408964152537145
+           : density == 8 ? 0.9170040432046712
+                          : 0.5;
+}
+
+// Quantised coefficients of values.
+template <class T>
+bool integers_of(const Search<T>& search, const std::vector<T>& values,
+                 std::vector<int32_t>& integers, fhash_error& error) {
+    std::vector<T> coefficients(values.size());
+    std::vector<float> scaled;
+    if (!kernel_done(search.forward->transform(values.data(), coefficients.data()), "a transform",
+                     error))
+        return false;
+    quantise_all(coefficients, search.settings.step, integers, scaled);
+    return true;
+}
+
+// The values where the search by falling thresholds ends.
+template <class T>
+bool search_filling(const Search<T>& search, const std::vector<T>& start, const uint8_t* counted,
+                    int density, double threshold, std::vector<T>& current, fhash_error& error) {
+    std::vector<T> guess = start, coefficients(start.size()), values(start.size());
+    current = start;
+    while (threshold > LOWEST) {
+        const T least = (T)(threshold * search.settings.step);
+        if (!kernel_done(search.forward->transform(guess.data(), coefficients.data()),
+                         "a transform", error))
+            return false;
+        for (T& c : coefficients)
+            if (std::fabs(c) < least) c = 0;
+        if (!kernel_done(search.inverse->invert(coefficients.data(), values.data()), "a transform",
+                         error))
+            return false;
+        for (size_t i = 0; i < start.size(); i++) {
+            const T before = current[i];
+            current[i] = counted[i] ? start[i] : values[i];
+            guess[i] = current[i] + (T)MOMENTUM * (current[i] - before);
+        }
+        threshold *= ratio_of(density);
+    }
+    return true;
+}
+
+// Bits of the magnitudes of all quantised coefficients.
+template <class T>
+bool bits_of(const Search<T>& search, const std::vector<T>& values, int64_t& bits,
+             fhash_error& error) {
+    std::vector<int32_t> integers;
+    if (!integers_of(search, values, integers, error)) return false;
+    bits = 0;
+    for (const int32_t q : integers) {
+        int exponent = 0;
+        if (q) std::frexp((float)q, &exponent);
+        bits += exponent;
+    }
+    return true;
+}
+
+// Bytes of the coded coefficients.
+template <class T>
+bool size_of(const Search<T>& search, const std::vector<T>& values, size_t& size,
+             fhash_error& error) {
+    std::vector<int32_t> integers;
+    Buffer data;
+    if (!integers_of(search, values, integers, error) ||
+        !encode_integers(integers, search.shape, search.table(), {}, data, error))
+        return false;
+    size = data.size();
+    return true;
+}
+
+}  // namespace
+
+template <class T>
+bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8_t* finite,
+                    int density, std::vector<T>& target, fhash_error& error) {
+    const size_t n = target.size();
+    double sum = 0;
+    int64_t count = 0;
+    for (size_t i = 0; i < n; i++)
+        if (counted[i]) {
+            sum += (double)target[i];
+            count++;
+        }
+    const T mean = (T)(sum / (double)count);
+    std::vector<T> starts[2] = {target, target}, results[2];
+    for (size_t i = 0; i < n; i++) {
+        if (!finite[i]) starts[0][i] = mean;
+        if (!counted[i]) starts[1][i] = mean;
+    }
+    if (density == 0)
+        return search_filling(search, starts[0], counted, 1, NEARBY, target, error);
+    int64_t bits[2];
+    for (int i = 0; i < 2; i++)
+        if (!search_filling(search, starts[i], counted, 1, HIGHEST, results[i], error) ||
+            !bits_of(search, results[i], bits[i], error))
+            return false;
+    const int better = bits[1] < bits[0];
+    target = results[better];
+    if (density > 1 && bits[better] >= FEW_BITS &&
+        !search_filling(search, starts[better], counted, density, HIGHEST, target, error))
+        return false;
+    // Bits are a rough measure: smooth values of many bits may be coded in few bytes.
+    size_t sizes[2];
+    if (!size_of(search, starts[0], sizes[0], error) || !size_of(search, target, sizes[1], error))
+        return false;
+    if (sizes[0] <= sizes[1]) target = starts[0];
+    return true;
+}
+
+#define FHASH_CHOOSE(T) \
+    template bool make_search(fhash_context&, const Settings&, const Shape&, \
+                              std::shared_ptr<Search<T>>&, fhash_error&); \
+    template bool choose_integers(const Search<T>&, const std::vector<T>&, double, int, \
+                                  std::vector<int32_t>&, fhash_error&); \
+    template bool code_coefficients(const Search<T>&, const std::vector<T>&, const fhash_coding&, \
+                                    Buffer&, std::vector<int32_t>&, fhash_error&); \
+    template bool fill_uncounted(const Search<T>&, const uint8_t*, const uint8_t*, int, \
+                                 std::vector<T>&, fhash_error&);
+FHASH_CHOOSE(float)
+FHASH_CHOOSE(double)
+
+}  // namespace fhash

@@ -1,0 +1,595 @@
+// Encoding of a tile to a stated quality: the search for a transform and a quantisation step.
+#include <cfloat>
+#include <cstdlib>
+
+#include "core.hpp"
+#include "encode.hpp"
+#include "numbers.hpp"
+
+namespace fhash {
+namespace {
+
+constexpr double WEIGHT = 0.09, TRELLIS_WEIGHT = 0.27;  // squared steps that a bit is worth
+constexpr int8_t TRELLIS_OFFSETS[OFFSET_COUNT] = {17, -10, -5, -3, -2, -1};
+constexpr int MAX_DEPTHS[4] = {1, 1, 5, 5};  // of a 9/7 transform along t, z, y, x
+constexpr int MAX_EFFORT = 9, MAX_LABELS = 65536, FEW_LABELS = 256;
+constexpr double REGION_SHARE = 0.5;  // of vertices with an equal neighbour: labels may be many
+constexpr double FIRST_RATIO = 2.5;   // step under a bound, in units of half the quantum
+constexpr double OTHER_RATIOS[] = {4.0, 1.6};
+constexpr int CLEARLY = 4;  // ratio of a deflated tile to its labels: nothing else is tried
+constexpr int64_t MAX_WINDOW = 1 << 16;       // values on which settings are tried at effort 2
+constexpr int WRITTEN = 4;                    // bounds that decoded fill values are away at most
+constexpr double QUANTUM_SHARE = 1 - 1e-6;    // of twice the largest error, for its rounding
+constexpr double MAX_STEPS = 2.5e8;           // largest coefficient, as estimated, in steps
+constexpr double MAX_VALUE = 1e300, MIN_STEP = 1e-290;
+constexpr double MAX_SINGLE = 1e30, MIN_SINGLE = 1e-30;  // for arithmetic in float32
+
+struct Spec {
+    uint8_t axes[4];  // kind times 16, plus depth
+
+    bool operator==(const Spec& other) const { return std::equal(axes, axes + 4, other.axes); }
+};
+
+int bit_length(int64_t n) {
+    int bits = 0;
+    for (; n; n >>= 1) bits++;
+    return bits;
+}
+
+// The transforms to try, each once: 9/7 along all axes; then Haar, and then none, along the first
+// axis longer than 1, which often is time; then Haar along all axes.
+std::vector<Spec> candidates(const Shape& shape) {
+    size_t first = 0;
+    while (first < 4 && shape[first] == 1) first++;
+    if (first == 4) return {Spec{{0, 0, 0, 0}}};
+    int depths[4];
+    for (size_t a = 0; a < 4; a++)
+        depths[a] = shape[a] < 2
+                        ? 0
+                        : std::max(1, std::min(MAX_DEPTHS[a], bit_length(shape[a]) - 3));
+    if (std::min(shape[2], shape[3]) >= 16) depths[2] = depths[3] = std::min(depths[2], depths[3]);
+    // Few tiles are long in time: there, two levels of Haar are worth it.
+    const int haar = first < 2 ? std::min(2, bit_length(shape[first]) - 1) : depths[first];
+    std::vector<Spec> specs;
+    const auto add = [&](int kind, int first_kind, int first_depth) {
+        Spec spec;
+        for (size_t a = 0; a < 4; a++)
+            spec.axes[a] = (uint8_t)(depths[a] ? kind << 4 | depths[a] : 0);
+        spec.axes[first] = (uint8_t)(first_kind << 4 | first_depth);
+        if (std::find(specs.begin(), specs.end(), spec) == specs.end()) specs.push_back(spec);
+    };
+    add(DAUBECHIES_KIND, DAUBECHIES_KIND, depths[first]);
+    add(DAUBECHIES_KIND, HAAR_KIND, haar);
+    add(DAUBECHIES_KIND, NONE_KIND, 0);
+    add(HAAR_KIND, HAAR_KIND, haar);
+    return specs;
+}
+
+// The numbers of settings that a search changes.
+struct Draft {
+    Spec spec;
+    double step, center, low, high, quantum;
+    bool real64, clip, trellis;
+    Wide origin;
+    int64_t whole_low, whole_high;  // ends of the range about an origin
+
+    std::shared_ptr<const Settings> settings(fhash_context& context, fhash_error& error) const {
+        Buffer packed;
+        const bool whole = !origin.zero();
+        packed.push_back((uint8_t)((real64 ? 1 : 0) | (clip ? 2 : 0) | (trellis ? 8 : 0) |
+                                   (whole ? 16 : 0)));
+        packed.insert(packed.end(), spec.axes, spec.axes + 4);
+        const auto put = [&](uint64_t bits) {
+            for (int byte = 0; byte < 8; byte++) packed.push_back((uint8_t)(bits >> 8 * byte));
+        };
+        const auto put_real = [&](double number) {
+            uint64_t bits;
+            std::memcpy(&bits, &number, sizeof bits);
+            put(bits);
+        };
+        for (const double number : {step, quantum, center}) put_real(number);
+        if (!whole)
+            for (const double end : {low, high}) put_real(end);
+        if (whole) {
+            put((uint64_t)whole_low);
+            put((uint64_t)whole_high);
+            put(origin.bits);
+            packed.push_back(origin.negative ? 255 : 0);
+        }
+        const int8_t* const offsets = trellis ? TRELLIS_OFFSETS : PLAIN_OFFSETS;
+        const int8_t none[OFFSET_COUNT] = {0};
+        const int8_t* const shifts = clip ? offsets : none;
+        packed.insert(packed.end(), (const uint8_t*)shifts, (const uint8_t*)shifts + OFFSET_COUNT);
+        return unpack_settings(context, packed.data(), packed.size(), error);
+    }
+};
+
+// A tile to code, of at least one finite value.
+struct Task {
+    fhash_context& context;
+    Shape shape;
+    int32_t type;
+    const uint8_t* values;
+    const fhash_quality& quality;
+    std::vector<uint8_t> finite;  // empty where all are
+    Wide origin;
+    double low, high;      // of the finite values, less the origin
+    int64_t whole_low, whole_high;  // the same, of integers
+    double ends[2];        // of the range that a relative bound is of
+    double error, reach;   // bound on decoded values, below 0 for none; and before they are rounded
+    bool signed_zero;      // a zero has a sign, or a value is below 0
+
+    int64_t size() const { return vertices(shape); }
+    bool whole() const { return type < FHASH_FLOAT16; }
+    size_t bytes() const { return (size_t)size() * fhash_type_size(type); }
+    bool lossless() const {
+        return error >= 0 && error < (whole() ? 1.0 : 4.9406564584124654e-324);
+    }
+    double half_range() const { return high / 2 - low / 2; }
+    double center() const { return low + half_range(); }
+    double largest() const { return std::max(std::fabs(low), std::fabs(high)); }
+};
+
+// Values without those that stood for `fill` in a tile that was coded before: who writes a part of
+// a tile codes what was decoded of the rest once more.
+void drop_moved(std::vector<double>& values, double fill, double fraction) {
+    if (values.empty()) return;
+    const auto span = [](const std::vector<double>& of) {
+        const auto ends = std::minmax_element(of.begin(), of.end());
+        return *ends.second - *ends.first;
+    };
+    const double near = fraction * span(values);
+    std::vector<double> others;
+    double farthest = -1;
+    for (const double value : values) {
+        const double way = std::fabs(value - fill);
+        if (way <= near) farthest = std::max(farthest, way);
+        else others.push_back(value);
+    }
+    if (farthest < 0 || others.empty()) return;
+    if (farthest <= WRITTEN * (fraction * span(others))) values = std::move(others);
+}
+
+// The values that a store may have put there: the fill value, and values that are the only one of a
+// plane at either end of an axis.
+template <class O> std::vector<O> fills_of(const Task& task, const O* values, const void* fill) {
+    std::vector<O> fills;
+    if (fill) {
+        fills.emplace_back();
+        std::memcpy(&fills[0], fill, sizeof(O));
+    }
+    for (size_t axis = 0; axis < 4; axis++) {
+        int64_t inner = 1, outer = 1;
+        for (size_t a = 0; a < axis; a++) outer *= task.shape[a];
+        for (size_t a = axis + 1; a < 4; a++) inner *= task.shape[a];
+        for (const int64_t end : {(int64_t)0, task.shape[axis] - 1}) {
+            const O first = values[end * inner];
+            bool same = true;
+            for (int64_t o = 0; o < outer && same; o++)
+                for (int64_t i = 0; i < inner && same; i++)
+                    same = real(values[(o * task.shape[axis] + end) * inner + i]) == real(first);
+            if (same) fills.push_back(first);
+        }
+    }
+    return fills;
+}
+
+// Ends of the range of the values that are no fill values, less the origin; 0 and 0 for none.
+template <class O> void find_ends(Task& task, const O* values, const void* fill) {
+    const auto fills = fills_of(task, values, fill);
+    const auto number = [&](const O& value) {
+        if constexpr (is_real<O>) return real(value);
+        else return task.origin.zero() ? real(value)
+                                       : (double)(int64_t)((uint64_t)value - task.origin.bits);
+    };
+    const auto same = [](const O& one, const O& other) {
+        if constexpr (is_real<O>) return real(one) == real(other);
+        else return one == other;
+    };
+    std::vector<double> kept;
+    for (int64_t i = 0; i < task.size(); i++) {
+        const bool is_fill = std::any_of(fills.begin(), fills.end(),
+                                         [&](const O& one) { return same(one, values[i]); });
+        if (std::isfinite(real(values[i])) && !is_fill) kept.push_back(number(values[i]));
+    }
+    for (const O& one : fills) drop_moved(kept, number(one), task.quality.max_error_rel);
+    task.ends[0] = task.ends[1] = 0;
+    if (kept.empty()) return;
+    const auto ends = std::minmax_element(kept.begin(), kept.end());
+    task.ends[0] = *ends.first;
+    task.ends[1] = *ends.second;
+}
+
+// The middle of a range of 64-bit integers of which some are beyond 2^53; 0 for others.
+template <class O> void set_origin(Task& task, O low, O high) {
+    const double most = std::max(std::fabs((double)low), std::fabs((double)high));
+    const auto exact = [](O number) {
+        constexpr uint64_t limit = 1ull << 53;
+        const bool below = number < 0;
+        return (below ? 0 - (uint64_t)number : (uint64_t)number) <= limit;
+    };
+    if (sizeof(O) == 8 && !(exact(low) && exact(high)) && most > 0) {
+        // (low + high + 1) / 2, rounded down
+        const uint64_t width = (uint64_t)high - (uint64_t)low;
+        task.origin.bits = (uint64_t)low + width / 2 + (width & 1);
+        task.origin.negative = low < 0 && (int64_t)task.origin.bits < 0;
+    }
+    task.whole_low = (int64_t)((uint64_t)low - task.origin.bits);
+    task.whole_high = (int64_t)((uint64_t)high - task.origin.bits);
+    task.low = (double)task.whole_low;
+    task.high = (double)task.whole_high;
+    if (task.origin.zero()) {
+        task.low = (double)low;
+        task.high = (double)high;
+    }
+}
+
+// Range, bound and missing values; false where no value is finite.
+template <class O> bool survey(Task& task, const O* values, const void* fill) {
+    bool any = false;
+    O low{}, high{};
+    task.signed_zero = false;
+    for (int64_t i = 0; i < task.size(); i++) {
+        const double value = real(values[i]);
+        if (!std::isfinite(value)) {
+            if (task.finite.empty()) task.finite.assign((size_t)task.size(), 1);
+            task.finite[(size_t)i] = 0;
+            continue;
+        }
+        if constexpr (is_real<O>) {
+            task.signed_zero |= std::signbit(value);
+            if (!any || value < real(low)) low = values[i];
+            if (!any || value > real(high)) high = values[i];
+        } else {
+            if (!any || values[i] < low) low = values[i];
+            if (!any || values[i] > high) high = values[i];
+        }
+        any = true;
+    }
+    if (!any) return false;
+    if constexpr (is_real<O>) {
+        task.low = real(low);
+        task.high = real(high);
+    } else {
+        set_origin(task, low, high);
+    }
+    if (task.quality.max_error_rel > 0) find_ends(task, values, fill);
+    return true;
+}
+
+// The bound on decoded values, and the largest error before they are rounded to their type.
+void set_bound(Task& task) {
+    const fhash_quality& quality = task.quality;
+    task.error = -1;
+    task.reach = 0;
+    if (quality.step > 0) return;
+    task.error = std::max(quality.max_error, 0.0);
+    if (quality.max_error_rel > 0) {
+        const double fraction = quality.max_error_rel, span = task.ends[1] - task.ends[0];
+        task.error = std::isfinite(span) ? fraction * span
+                                         : fraction * task.ends[1] - fraction * task.ends[0];
+    }
+    if (task.whole()) {
+        task.reach = std::floor(task.error) + 0.5;
+        return;
+    }
+    const double epsilon = task.type == FHASH_FLOAT16   ? 0x1p-10
+                           : task.type == FHASH_FLOAT32 ? FLT_EPSILON
+                                                        : DBL_EPSILON;
+    task.reach = task.error - task.largest() * epsilon;
+}
+
+// Settings and options of the encoder, and what they made of a window.
+struct Trial {
+    Draft draft;
+    fhash_coding coding;
+    Coded coded;
+    bool whole = false;  // the window was the tile
+
+    bool run(const Task& task, const uint8_t* values, const Shape& shape, fhash_error& error) {
+        const auto settings = draft.settings(task.context, error);
+        whole = shape == task.shape;
+        return settings && encode_tile(task.context, settings, shape, task.type, values, nullptr,
+                                       coding, coded, error);
+    }
+};
+
+// A block of at most `most` values from the middle of a tile.
+Buffer window_of(const Task& task, int64_t most, Shape& lengths) {
+    lengths = task.shape;
+    while (vertices(lengths) > most) {
+        auto longest = std::max_element(lengths.begin(), lengths.end());
+        *longest = (*longest + 1) / 2;
+    }
+    const size_t width = fhash_type_size(task.type);
+    int64_t start[4];
+    for (size_t a = 0; a < 4; a++) start[a] = (task.shape[a] - lengths[a]) / 2;
+    Buffer window;
+    for (int64_t t = 0; t < lengths[0]; t++)
+        for (int64_t z = 0; z < lengths[1]; z++)
+            for (int64_t y = 0; y < lengths[2]; y++) {
+                const int64_t row = ((start[0] + t) * task.shape[1] + start[1] + z) *
+                                        task.shape[2] + start[2] + y;
+                const uint8_t* const from =
+                    task.values + (size_t)(row * task.shape[3] + start[3]) * width;
+                window.insert(window.end(), from, from + (size_t)lengths[3] * width);
+            }
+    return window;
+}
+
+// The trial of the transform, then the step, then the quantiser that takes the fewest bytes.
+bool best_trial(const Task& task, const std::vector<Spec>& specs, int64_t most, Trial& best,
+                fhash_error& error) {
+    const bool bounded = task.error >= 0;
+    if (specs.size() == 1 && !bounded) return true;
+    Shape lengths;
+    const Buffer window = window_of(task, most, lengths);
+    const auto take_better = [&](Trial trial, bool first) {
+        if (!trial.run(task, window.data(), lengths, error)) return false;
+        if (first || trial.coded.data.size() < best.coded.data.size()) best = std::move(trial);
+        return true;
+    };
+    const Trial begin = best;
+    for (size_t i = 0; i < specs.size(); i++) {
+        Trial trial = begin;
+        trial.draft.spec = specs[i];
+        if (!take_better(std::move(trial), i == 0)) return false;
+    }
+    if (!bounded) return true;
+    const Draft chosen = best.draft;
+    for (const double ratio : OTHER_RATIOS) {
+        Trial trial = begin;
+        trial.draft = chosen;
+        trial.draft.step = ratio * task.reach;
+        if (!take_better(std::move(trial), false)) return false;
+    }
+    if (best.draft.real64) return true;  // steps so fine come near the finest one of the trellis
+    Trial other = begin;
+    other.draft = best.draft;
+    other.draft.trellis = true;
+    other.draft.step *= TRELLIS_SHARE;
+    other.coding.weight = TRELLIS_WEIGHT;
+    return take_better(std::move(other), false);
+}
+
+// Whether float32 would lose what the step keeps.
+bool needs_real64(const Task& task, double step) {
+    const double largest = task.largest(), span = 2 * task.half_range();
+    if (std::max(largest, step) > MAX_SINGLE || step < MIN_SINGLE) return true;
+    return fhash_type_size(task.type) >= 4 &&
+           (span / step > 1 << 18 || (task.type != FHASH_FLOAT32 && largest / step > 1 << 20));
+}
+
+// The tile coded by transform; false without an error where that cannot be.
+bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, Coded& coded,
+                 fhash_error& error) {
+    const double given = task.quality.step;
+    const double step = given > 0 ? given : FIRST_RATIO * task.reach;
+    const bool too_fine = task.error >= 0 && task.reach < task.error / 2;
+    const bool in_range = step >= MIN_STEP && task.largest() <= MAX_VALUE &&
+                          task.half_range() / step < MAX_STEPS;
+    if (too_fine || !in_range) return false;
+    Trial trial;
+    trial.draft = {specs[0], step, task.center(), task.low, task.high,
+                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE,
+                   needs_real64(task, step), true, false, task.origin, task.whole_low,
+                   task.whole_high};
+    trial.coding = {WEIGHT, task.error, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
+    if (effort > 1 && !best_trial(task, specs, MAX_WINDOW << 2 * (effort - 2), trial, error))
+        return false;
+    const auto settings = trial.draft.settings(task.context, error);
+    if (!settings) return false;
+    const Norms norms = norms_of(task.context, settings->axes, task.shape);
+    const double gain = *std::max_element(norms.tz.begin(), norms.tz.end()) *
+                        *std::max_element(norms.yx.begin(), norms.yx.end());
+    if (task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
+    if (!trial.whole && !trial.run(task, task.values, task.shape, error)) return false;
+    coded = std::move(trial.coded);
+    return true;
+}
+
+// A tile whose finite values all decode to one value.
+bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
+              fhash_error& error) {
+    const int64_t whole = (int64_t)center;
+    const Draft draft = {{{0, 0, 0, 0}}, 1.0, center, center, center, 0, true, false, false, origin,
+                         whole, whole};
+    const auto settings = draft.settings(task.context, error);
+    const fhash_coding coding = {0, -1, 0, 0, 1, 0, 1, 1, 1, 0};
+    const std::vector<uint8_t> nothing((size_t)task.size(), 0);
+    return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
+                                   nothing.data(), coding, coded, error);
+}
+
+bool exactly(const Task& task, Coded& coded, fhash_error& error) {
+    return encode_exact(nullptr, task.shape, task.type, task.values, nullptr, coded, error);
+}
+
+// The tile as a constant, if all values are equal or the bound allows it. done: whether it is
+// coded.
+bool encode_constant(const Task& task, Coded& coded, bool& done, fhash_error& error) {
+    done = false;
+    const bool equal = task.high == task.low;
+    if (!equal && (task.error < 0 || task.half_range() > task.reach)) return true;
+    if (!constant(task, task.center(), task.origin, coded, error)) return false;
+    // A lossless zero keeps its sign, and a constant has one sign only.
+    const bool sign = task.error == 0 && task.low == 0 && task.signed_zero;
+    done = !sign && with_type(task.type, [&](auto value) {
+        using O = decltype(value);
+        return is_within((const O*)(const void*)task.values,
+                         (const O*)(const void*)coded.decoded.data(),
+                         task.finite.empty() ? nullptr : task.finite.data(), task.size(),
+                         std::max(task.error, 0.0));
+    });
+    if (done || !equal) return true;
+    done = true;
+    return exactly(task, coded, error);
+}
+
+// Whether many values equal the one before along one of the axes.
+template <class O> bool has_regions(const O* values, const Shape& shape) {
+    const int64_t n = vertices(shape);
+    const int64_t strides[4] = {shape[1] * shape[2] * shape[3], shape[2] * shape[3], shape[3], 1};
+    int64_t equal = 0;
+    for (int64_t i = 0; i < n; i++)
+        for (int a = 0; a < 4; a++)
+            if (i / strides[a] % shape[(size_t)a] &&
+                real(values[i]) == real(values[i - strides[a]])) {
+                equal++;
+                break;
+            }
+    return (double)equal / (double)n >= REGION_SHARE;
+}
+
+bool encode_task(const Task& task, const std::vector<Spec>& specs, int effort, Coded& coded,
+                 fhash_error& error) {
+    bool done;
+    if (!encode_constant(task, coded, done, error)) return false;
+    if (done) return true;
+    Coded exact, labelled, other;
+    bool has_labels = false;
+    if (task.lossless()) {
+        const bool regions = with_type(task.type, [&](auto value) {
+            return has_regions((const decltype(value)*)(const void*)task.values, task.shape);
+        });
+        has_labels = encode_labelled(nullptr, task.shape, task.type, task.values, nullptr,
+                                     regions ? MAX_LABELS : FEW_LABELS, labelled, error);
+        if (!has_labels && error.status != FHASH_OK) return false;
+        if (has_labels) {
+            if (!exactly(task, exact, error)) return false;
+            if (CLEARLY * labelled.data.size() < exact.data.size()) {
+                coded = std::move(labelled);
+                return true;
+            }
+        }
+    }
+    const bool has_other = transformed(task, specs, effort, other, error);
+    if (!has_other && error.status != FHASH_OK) return false;
+    const auto small = [&](bool there, const Coded& one) {
+        return there && 2 * one.data.size() < task.bytes();
+    };
+    coded.data.clear();
+    if (!small(has_other, other) && !small(has_labels, labelled) &&
+        !exactly(task, coded, error))
+        return false;
+    const auto take = [&](bool there, Coded& one) {
+        if (there && (coded.data.empty() || one.data.size() < coded.data.size()))
+            coded = std::move(one);
+    };
+    take(has_other, other);
+    take(has_labels, labelled);
+    return true;
+}
+
+bool check_quality(const fhash_quality* quality, fhash_error& error) {
+    if (!quality) return fail(error, FHASH_ERROR_ARGUMENT, "no quality is given");
+    const int given =
+        (quality->max_error >= 0) + (quality->max_error_rel > 0) + (quality->step > 0);
+    const bool finite = std::isfinite(quality->max_error) && std::isfinite(quality->step) &&
+                        std::isfinite(quality->max_error_rel);
+    if (given != 1 || !finite || quality->max_error_rel < 0 || quality->step < 0)
+        return fail(error, FHASH_ERROR_ARGUMENT,
+                    "one of max_error (from 0 on), max_error_rel and step (above 0) is needed");
+    if (quality->effort < 1 || quality->effort > MAX_EFFORT)
+        return fail(error, FHASH_ERROR_ARGUMENT, "effort is 1 to %d, not %d", MAX_EFFORT,
+                    quality->effort);
+    for (int a = 0; quality->transform_given && a < 4; a++) {
+        const int kind = quality->transform[a] >> 4, depth = quality->transform[a] & 15;
+        if (kind > DAUBECHIES_KIND || depth > 10 || (kind == 0) != (depth == 0))
+            return fail(error, FHASH_ERROR_ARGUMENT, "a transform is none, or a wavelet's levels");
+    }
+    return true;
+}
+
+}  // namespace
+
+bool encode_quality(fhash_context& context, const fhash_tile* tile, const void* values,
+                    const fhash_quality* quality, const void* fill, Coded& coded,
+                    fhash_error& error) {
+    if (!tile || !values || !is_shape(tile->shape) || !fhash_type_size(tile->type) ||
+        tile->settings)
+        return fail(error, FHASH_ERROR_ARGUMENT,
+                    "a tile to encode has values, a type, four lengths, and no settings");
+    if (!check_quality(quality, error)) return false;
+    Task task = {context, {}, tile->type, (const uint8_t*)values, *quality, {}, {}, 0, 0, 0, 0,
+                 {0, 0}, -1, 0, false};
+    std::copy_n(tile->shape, 4, task.shape.begin());
+    if (!may_use(context, 96 * (uint64_t)task.size(), error)) return false;
+    const bool any = with_type(task.type, [&](auto value) {
+        return survey(task, (const decltype(value)*)values, fill);
+    });
+    if (!any) return constant(task, 0.0, {}, coded, error);
+    set_bound(task);
+    std::vector<Spec> specs = candidates(task.shape);
+    if (quality->transform_given) {
+        specs.resize(1);
+        std::copy_n(quality->transform, 4, specs[0].axes);
+    }
+    return encode_task(task, specs, quality->effort, coded, error);
+}
+
+}  // namespace fhash
+
+using namespace fhash;
+
+size_t fhash_tile_bound(const fhash_tile* tile) {
+    if (!tile || !is_shape(tile->shape)) return 0;
+    const size_t bytes = (size_t)(tile->shape[0] * tile->shape[1] * tile->shape[2] *
+                                  tile->shape[3]) * fhash_type_size(tile->type);
+    return bytes + bytes / 64 + 4096;  // that of an exact stream is the largest
+}
+
+int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const void* values,
+                          const fhash_quality* quality, const void* fill, void* stream, size_t room,
+                          size_t* size, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        Coded coded;
+        if (!context || !size)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a context and a size are needed");
+        if (!encode_quality(*context, tile, values, quality, fill, coded, failed)) return false;
+        *size = coded.data.size();
+        if (*size > room || !stream)
+            return fail(failed, FHASH_ERROR_SIZE, "the stream has %zu bytes, the room %zu", *size,
+                        room);
+        std::memcpy(stream, coded.data.data(), *size);
+        return true;
+    });
+}
+
+// Code a tile with the settings of `tile`; without any it is stored without loss.
+//
+// in_coreset: the values that count, or without settings the mask of the stream; null for all. decoded: room for the decoded values, or null.
+// data, size: get the stream, which fhash_tile_free releases. nonzero: coded integers other than 0.
+FHASH_EXPORT int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile,
+                                     const void* values, const uint8_t* in_coreset,
+                                     const fhash_coding* coding, void* decoded, uint8_t** data,
+                                     size_t* size, int64_t* nonzero, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        if (!is_shape(tile->shape))
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a tile has four lengths");
+        Shape shape;
+        std::copy_n(tile->shape, 4, shape.begin());
+        Coded coded;
+        if (tile->settings) {
+            const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
+                                                  tile->settings_size, failed);
+            if (!settings || !encode_tile(*context, settings, shape, tile->type, values,
+                                          in_coreset, *coding, coded, failed))
+                return false;
+        } else if (!encode_exact(nullptr, shape, tile->type, values, in_coreset, coded, failed)) {
+            return false;
+        }
+        *data = (uint8_t*)std::malloc(coded.data.size());
+        if (!*data) return fail(failed, FHASH_ERROR_MEMORY, "no memory for a stream");
+        std::memcpy(*data, coded.data.data(), coded.data.size());
+        *size = coded.data.size();
+        *nonzero = coded.nonzero;
+        if (decoded) std::memcpy(decoded, coded.decoded.data(), coded.decoded.size());
+        return true;
+    });
+}
+
+FHASH_EXPORT int32_t fhash_tile_free(uint8_t* data) {
+    std::free(data);
+    return 0;
+}

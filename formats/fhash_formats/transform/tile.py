@@ -1,0 +1,443 @@
+"""Coding of a tile by the native library (native/tile.cpp, native/encode.cpp)."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats import native
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.arrays import Mask, Values
+from fhash_formats.support.threads import usable_threads
+from fhash_formats.transform.tile_format import Shape, TileSettings
+from fhash_formats.transform.values import about_origin, at_origin
+
+WEIGHT = 0.09
+"""Squared steps of the plain quantiser that a bit is worth (best between 0.07 and 0.11 in
+experiments)."""
+OFFSETS = (-5, -1, 0, 0, 0, 0)
+"""Shift, in 1/128 step, of the decoded magnitudes after the optimisation, see FORMAT.md, Decoding.
+
+native/encode.hpp has the same, and SHARE."""
+SHARE = 0.65
+"""Step on the trellis as a share of the plain quantiser's of about the same error and bytes."""
+TRELLIS_WEIGHT = 0.27
+"""Squared steps on the trellis that a bit is worth (0.25 to 0.3 are alike in experiments)."""
+TRELLIS_OFFSETS = (17, -10, -5, -3, -2, -1)
+"""The same with two quantisers.
+
+It is the mean over coefficients of many series, which differ by 3 or less.
+"""
+DENSITIES = (1, 2, 4, 8)
+"""Thresholds per factor of two with which values may be filled."""
+
+_MEMORY, _DAMAGED = -2, -3
+"""Statuses of the native library (fhash.h)."""
+_TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+"""Types of arrays in the order of their numbers in fhash.h, from 1."""
+
+_OPTIONS = (
+    "rounds",
+    "rough",
+    "passes",
+    "filled",
+    "density",
+    "keep_missing",
+    "own_settings",
+    "fast",
+)
+"""Whole numbers and switches of a `Coding`, in the order of native/encode.hpp."""
+
+
+class _Error(ctypes.Structure):
+    _fields_ = (("status", ctypes.c_int32), ("text", ctypes.c_char * 500))
+
+
+class _Coding(ctypes.Structure):
+    _fields_ = (
+        ("weight", ctypes.c_double),
+        ("error", ctypes.c_double),
+        *((name, ctypes.c_int32) for name in _OPTIONS),
+    )
+
+
+class _Quality(ctypes.Structure):
+    _fields_ = (
+        ("max_error", ctypes.c_double),
+        ("max_error_rel", ctypes.c_double),
+        ("step", ctypes.c_double),
+        ("effort", ctypes.c_int32),
+        ("transform_given", ctypes.c_int32),
+        ("transform", ctypes.c_uint8 * 4),
+        ("reserved", ctypes.c_int32),
+    )
+
+
+class _Tile(ctypes.Structure):
+    _fields_ = (
+        ("shape", ctypes.c_int64 * 4),
+        ("type", ctypes.c_int32),
+        ("reserved", ctypes.c_int32),
+        ("settings", ctypes.c_char_p),
+        ("settings_size", ctypes.c_size_t),
+    )
+
+
+@lru_cache
+def _context(threads: int) -> ctypes.c_void_p:
+    """What calls that use so many threads share."""
+    return ctypes.c_void_p(native.library().fhash_context_create(0, threads))
+
+
+if hasattr(os, "register_at_fork"):  # a thread of the parent may have held the context's lock
+    os.register_at_fork(after_in_child=_context.cache_clear)
+
+
+def _tile(shape: Shape, dtype: np.dtype[Any], settings: TileSettings | None) -> _Tile:
+    packed = None if settings is None else settings.packed
+    number = _TYPES.index(f"{dtype.kind}{dtype.itemsize}") + 1
+    return _Tile((ctypes.c_int64 * 4)(*shape), number, 0, packed, len(packed or b""))
+
+
+def _tile_of(values: Values, settings: TileSettings) -> _Tile:
+    t, z, y, x = values.shape
+    return _tile((t, z, y, x), values.dtype, settings)
+
+
+def _call(name: str, tile: _Tile, *arguments: Any) -> None:
+    """Call a function on a tile. Raises DamagedFileError, InputError or MemoryError."""
+    error = _Error()
+    context = _context(usable_threads())
+    function = getattr(native.library(), name)
+    status = function(context, ctypes.byref(tile), *arguments, ctypes.byref(error))
+    if not status:
+        return
+    text = error.text.decode("utf-8", "replace")
+    if status == _MEMORY:
+        raise MemoryError(text)
+    raise (DamagedFileError if status == _DAMAGED else InputError)(text)
+
+
+def _stream(data: bytes | memoryview) -> tuple[ctypes.c_void_p, int]:
+    """Address and size of a stream; the pointer keeps the bytes alive."""
+    return np.frombuffer(data, np.uint8).ctypes.data_as(ctypes.c_void_p), len(data)
+
+
+def _pointer(array: npt.NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coding:
+    """Options of the encoder: how hard it works, what it keeps. A decoder needs none of them.
+
+    Attributes:
+        weight: squared quantiser steps that a bit is worth in rate-distortion optimisation; 0 for
+            none.
+        error: bound on |decoded - value| at every counted value, in units of the values. It is kept
+            strictly; a tile that cannot keep it is stored without loss. None for no bound.
+        rounds: how often the values that are free to change are replaced by their decoded values.
+        rough: whether these are those of the nearest integers, and not of those that are chosen.
+        passes: 2 codes the integers that the optimisation chose once more, or searches the path
+            through the trellis once more; 1 does not.
+        filled: whether the values that are not counted are a good filling already, such as repeated
+            border values. Otherwise the encoder looks for a better one.
+        density: how thoroughly it looks; see `filled`.
+        keep_missing: whether values that are not finite come back as they were.
+        own_settings: whether the stream holds the settings.
+        fast: whether coefficients and residual are coded by the fast coder, for more bytes.
+    """
+
+    weight: float = 0.0
+    error: float | None = None
+    rounds: int = 0
+    rough: bool = False
+    passes: int = 1
+    filled: bool = False
+    density: int = 1
+    keep_missing: bool = True
+    own_settings: bool = False
+    fast: bool = False
+
+
+_DEFAULT_CODING = Coding()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodedTile:
+    """A coded tile.
+
+    Attributes:
+        data: the stream.
+        decoded: the values that the stream decodes to, in the type of the source.
+        nonzero: number of coded integers that are not 0.
+    """
+
+    data: bytes
+    decoded: Values
+    nonzero: int
+
+
+def decode_tile(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None = None,
+    lod: int = 0,
+) -> Values:
+    """The values (t, z, y, x) of a stream, in the type of the source.
+
+    Args:
+        data: the stream.
+        shape: shape of the tile.
+        dtype: type of the source.
+        settings: settings that all tiles share; a stream's own settings replace them.
+        lod: level of detail. n gives every 2^n-th vertex along z, y, x, low-passed, without head,
+            residual, missing values and mask.
+
+    Raises DamagedFileError for bytes that no encoder writes.
+    """
+    kind = np.dtype(dtype)
+    values = np.empty(_lod_shape(shape, lod), kind)
+    tile = _tile(shape, kind, settings)
+    _call("fhash_tile_decode", tile, *_stream(data), lod, _pointer(values), None)
+    return values
+
+
+def decode_tile_mask(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None = None,
+) -> tuple[Values, Mask]:
+    """The values of a stream as `decode_tile` gives them, and which of them are occupied.
+
+    All values are occupied where the stream has no mask.
+    """
+    kind = np.dtype(dtype)
+    values, mask = np.empty(shape, kind), np.empty(shape, np.bool_)
+    tile = _tile(shape, kind, settings)
+    _call("fhash_tile_decode", tile, *_stream(data), 0, _pointer(values), _pointer(mask))
+    return values, mask
+
+
+def decode_tile_table(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None = None,
+    lod: int = 0,
+) -> Values:
+    """The table (t, z, y, x) of a tile: its values before head, residual and rounding.
+
+    They are finite, of `TileSettings.table_dtype` (float64 without settings). Where the tile is not
+    coded by transform, they are its values; `center` stands for those that are not finite.
+    Arguments and errors are those of `decode_tile`.
+    """
+    room = np.empty(_lod_shape(shape, lod), np.float64)
+    wide, origin = ctypes.c_int32(), (ctypes.c_uint64 * 2)()
+    tile, results = _tile(shape, np.dtype(dtype), settings), (ctypes.byref(wide), origin)
+    _call("fhash_tile_table", tile, *_stream(data), lod, _pointer(room), *results)
+    table = room if wide else room.reshape(-1).view(np.float32)[: room.size].reshape(room.shape)
+    first = origin[0] - (origin[1] << 64)
+    return table.astype(np.float64) + first if first else table
+
+
+def encode_tile(
+    values: Values,
+    settings: TileSettings,
+    coding: Coding = _DEFAULT_CODING,
+    *,
+    in_coreset: Mask | None = None,
+) -> CodedTile:
+    """Code the values of a tile.
+
+    Args:
+        values: the tile (t, z, y, x), of any real type, with the origin of the settings.
+        settings: transform, step, range and so on.
+        coding: options of the encoder.
+        in_coreset: the values that count, of the same shape; None for all. Values that are not
+            finite never count.
+
+    Raises InputError for values that have no differences from the origin.
+    """
+    if not values.size:
+        return CodedTile(data=b"", decoded=values.copy(), nonzero=0)
+    return _coded(values, settings, coding, in_coreset)
+
+
+def encode_for(tile: Values, quality: tuple[Any, ...], fill: Values | None) -> bytes:
+    """The stream of a tile (t, z, y, x), with settings of its own, for a quality.
+
+    quality: the numbers of `fhash_quality` (fhash.h). fill: the store's fill value, or None.
+    """
+    *numbers, transform = quality
+    t, z, y, x = tile.shape
+    of = _tile((t, z, y, x), tile.dtype, None)
+    room = np.empty(native.library().fhash_tile_bound(ctypes.byref(of)), np.uint8)
+    asked, size = _Quality(*numbers, (ctypes.c_uint8 * 4)(*transform)), ctypes.c_size_t()
+    blank = None if fill is None else _pointer(fill)
+    results = (_pointer(room), room.size, ctypes.byref(size))
+    _call("fhash_tile_encode", of, _pointer(tile), ctypes.byref(asked), blank, *results)
+    return room[: size.value].tobytes()
+
+
+def exact_tile(
+    values: Values, settings: None = None, occupied: Mask | None = None, *, origin: int = 0
+) -> CodedTile:
+    """A tile stored without loss: its bytes, those of equal weight together, deflated.
+
+    Args:
+        values: the tile (t, z, y, x), of any real type.
+        settings: None, for a stream without settings of its own.
+        occupied: the mask, for a stream with one. Values outside of it become NaN, or 0 for
+            integers.
+        origin: integer that is subtracted from the values, where they have not lost it yet.
+    """
+    if origin:
+        coded = exact_tile(about_origin(values, origin), settings, occupied)
+        return replace(coded, decoded=at_origin(coded.decoded, origin, values.dtype))
+    return _coded(values, settings, _DEFAULT_CODING, occupied)
+
+
+def _coded(
+    values: Values, settings: TileSettings | None, coding: Coding, mask: Mask | None
+) -> CodedTile:
+    """The coded tile; without settings it is stored without loss."""
+    values = np.ascontiguousarray(values)
+    given = None if mask is None else np.ascontiguousarray(mask, np.bool_)
+    options = (getattr(coding, name) for name in _OPTIONS)
+    asked = _Coding(coding.weight, -1 if coding.error is None else coding.error, *options)
+    decoded = np.empty_like(values)
+    data, size, nonzero = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_size_t(), ctypes.c_int64()
+    t, z, y, x = values.shape
+    _call(
+        "fhash_tile_code",
+        _tile((t, z, y, x), values.dtype, settings),
+        _pointer(values),
+        None if given is None else _pointer(given),
+        ctypes.byref(asked),
+        _pointer(decoded),
+        *(ctypes.byref(result) for result in (data, size, nonzero)),
+    )
+    try:
+        stream = ctypes.string_at(data, size.value)
+    finally:
+        native.library().fhash_tile_free(data)
+    return CodedTile(data=stream, decoded=decoded, nonzero=nonzero.value)
+
+
+def with_trellis(settings: TileSettings) -> TileSettings:
+    """The settings with two quantisers in place of the plain one, at about the same error."""
+    return replace(settings, trellis=True, step=settings.step * SHARE, offsets=TRELLIS_OFFSETS)
+
+
+def plain_step(settings: TileSettings) -> float:
+    """The step with which the plain quantiser errs about as much, in units of the values."""
+    return settings.step / SHARE if settings.trellis else settings.step
+
+
+def filled(
+    target: Values, counted: Mask, finite: Mask, settings: TileSettings, density: int = 1
+) -> Values:
+    """`target` (t, z, y, x) with fill values where it is not counted.
+
+    The search starts from the present values, which often continue the counted ones, or from the
+    mean of the counted values, whichever takes fewer bits. The present values stay where they take
+    no more bytes than the result.
+
+    Args:
+        target: the tile, in the working type.
+        counted: the values to keep.
+        finite: where the tile has present values.
+        settings: settings of the tile; the step is the one the fill values are made for.
+        density: thresholds per factor of two, one of DENSITIES. 0 goes on from a filling that was
+            made for other settings, by a few thresholds.
+    """
+    result = np.array(target, settings.dtype, order="C")
+    masks = [np.ascontiguousarray(mask, np.bool_) for mask in (counted, finite)]
+    pointers = [_pointer(array) for array in (*masks, result)]
+    _call("fhash_tile_fill", _tile_of(result, settings), *pointers[:2], density, pointers[2])
+    return result
+
+
+def forward(values: Values, settings: TileSettings) -> Values:
+    """Coefficients of a tile (t, z, y, x): a new array of the working type, low bands first.
+
+    Entries beyond a basis's rank are 0. Raises InputError for a basis that cannot encode, and
+    DamagedFileError for one of another length than its axis.
+    """
+    values = np.ascontiguousarray(values, settings.dtype)
+    result = np.empty_like(values)
+    _call("fhash_tile_forward", _tile_of(values, settings), _pointer(values), _pointer(result))
+    return result
+
+
+def foretell(
+    coefficients: Values, settings: TileSettings, scale: float, weight: float
+) -> tuple[float, float]:
+    """The bytes that the fast coder would take for coefficients, and the sum of squared errors.
+
+    Args:
+        coefficients: float32 (t, z, y, x).
+        settings: settings of the tile.
+        scale: 1 / quantiser step.
+        weight: squared steps that a bit is worth.
+
+    Returns bytes, and the error in squared steps.
+    """
+    results = (ctypes.c_double * 2)()
+    tile = _tile_of(coefficients, settings)
+    _call("fhash_tile_foretell", tile, _pointer(coefficients), scale, weight, results)
+    return results[0], results[1]
+
+
+def _lod_shape(shape: Shape, lod: int) -> tuple[int, ...]:
+    """Shape of a tile at a level of detail."""
+    return (shape[0], *(-(-n // (1 << lod)) for n in shape[1:]))
+
+
+def uncorrected(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings,
+    part: tuple[slice, ...],
+) -> Values | None:
+    """The values of a tile before its head, where nothing but `corrected_region` is left to do.
+
+    They are less the origin of the settings. None for other tiles, and where the part is a large
+    one.
+
+    Raises DamagedFileError for bytes that no encoder writes.
+    """
+    table, done = np.empty(shape, np.float32), ctypes.c_int32()
+    results = (_part(part), _pointer(table), ctypes.byref(done))
+    tile = _tile(shape, np.dtype(dtype), settings)
+    _call("fhash_tile_uncorrected", tile, *_stream(data), *results)
+    return table if done else None
+
+
+def corrected_region(
+    table: Values, part: tuple[slice, ...], dtype: npt.DTypeLike, settings: TileSettings
+) -> Values:
+    """A part of the values of a tile, as `decode_tile` gives them, in a new array.
+
+    table: what `uncorrected` gave. part: slices (t, z, y, x) with explicit ends.
+    """
+    values = np.empty([along.stop - along.start for along in part], dtype)
+    t, z, y, x = table.shape
+    tile = _tile((t, z, y, x), values.dtype, settings)
+    _call("fhash_tile_part", tile, _pointer(table), _part(part), _pointer(values))
+    return values
+
+
+def _part(part: tuple[slice, ...]) -> Any:
+    """First and last vertex along each axis."""
+    return (ctypes.c_int64 * 8)(*(end for along in part for end in (along.start, along.stop)))
