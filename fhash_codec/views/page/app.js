@@ -14,7 +14,9 @@ import { timeText } from "./times.js";
 
 const COARSE = 2 ** 16;
 const MOST_VERTICES = 2 ** 27;
-const BINS = 256;
+const BINS = 512;
+const COUNTED = 2 ** 18;
+const MOST_COUNTED = 64 * 2 ** 20;
 const MOST_PIXELS = 2 ** 22;
 const BAND_MS = 40;
 
@@ -126,6 +128,23 @@ function levels() {
   return { fine: Math.max(app.scene.march?.lod ?? fine, fine), coarse };
 }
 
+/** Count the values of the first, middle and last step, as `fhash render` does where it chooses the opacity. */
+async function count() {
+  const { number, container } = app, about = variable(), { box } = about, last = about.shape[0] - 1, opacity = app.scene.transfer_function?.opacity ?? "auto";
+  if (app.counts.whole || !["auto", "feature"].includes(opacity) || about.features.length || container.about.size > MOST_COUNTED) return;
+  app.counts.whole = true;
+  let lod = 0;
+  while (lod < about.levels && ((box[1] - box[0]) * (box[3] - box[2]) * (box[5] - box[4])) / 8 ** lod > COUNTED) lod++;
+  const sum = new Array(BINS).fill(0);
+  for (const step of new Set([0, Math.floor(last / 2), last])) {
+    const frame = await container.frame({ number, step, lod, smoothing: 0 });
+    histogram(frame, [about.low, about.high], BINS).forEach((one, n) => { sum[n] += one; });
+  }
+  if (container !== app.container || number !== app.number) return;
+  app.counts = Object.assign(sum, { lod: 0, whole: true });
+  restyle();
+}
+
 /** Read what is to be shown, the coarse level first where nothing is there yet, and show it. */
 export async function show() {
   const wanted = ++app.wanted, { fine, coarse } = levels(), about = variable();
@@ -144,6 +163,7 @@ export async function show() {
       frame = await app.container.frame(ask(app.step, fine));
       if (wanted === app.wanted) take(frame);
     }
+    await count();
     for (let n = 1; n <= 4 && app.playing; n++) app.container.ahead(ask(next(n), fine));
   } catch (error) {
     if (wanted !== app.wanted) return;
@@ -167,7 +187,7 @@ const smoothing = () => (app.tf && app.mode === "volume" && app.marcher ? smooth
 function take(frame) {
   const about = variable();
   app.frame = frame;
-  if (!app.counts || app.counts.lod > frame.lod) {
+  if (!app.counts || (app.counts.lod > frame.lod && !app.counts.whole)) {
     app.counts = histogram(frame, [about.low, about.high], BINS);
     app.counts.lod = frame.lod;
   }

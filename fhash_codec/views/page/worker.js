@@ -1,7 +1,9 @@
 // Decodes a container by fhash.wasm (fhash.h). It reads synchronously: of a URL by ranges, or of a file.
 
-const BLOCK = 1 << 16;
-const KEPT = 1024;
+const BLOCK = 1 << 14;
+const TAIL = 4;
+const MOST_AHEAD = 64;
+const KEPT = 4096;
 const SIDE = 8;
 const FLOAT32 = 10;
 const PRIORS = ["prior.bin", "mask_prior.bin", "fast_prior.bin"];
@@ -27,7 +29,7 @@ function asked(method, url, range) {
   return request;
 }
 
-/** Bytes of a container in blocks, which are kept, those used last the longest. */
+/** Bytes of a container in blocks, which are kept, those used last the longest. The last block ends with the file. */
 class Source {
   constructor({ url, blob, blocks, size }) {
     this.url = url;
@@ -42,22 +44,35 @@ class Source {
 
   /** Ask for the end of the file, which says its size, too. */
   measure() {
-    const tail = this.ask(`bytes=-${BLOCK}`);
-    const range = tail.getResponseHeader("Content-Range")?.match(/(\d+)-(\d+)\/(\d+)/);
-    let data = new Uint8Array(tail.response);
+    const tail = this.ask(`bytes=-${TAIL * BLOCK}`), data = new Uint8Array(tail.response);
     if (tail.status === 200) {
       this.bytes = data;
       this.size = data.length;
       return;
     }
-    if (range) this.size = Number(range[3]);
-    else {
-      this.size = Number(asked("HEAD", this.url).getResponseHeader("Content-Length"));
-      if (!(this.size > 0)) throw new Error("the server does not say how large the file is");
+    const range = tail.getResponseHeader("Content-Range")?.match(/(\d+)-(\d+)\/(\d+)/);
+    this.size = Number(range ? range[3] : asked("HEAD", this.url).getResponseHeader("Content-Length"));
+    if (!(this.size >= data.length && this.size > 0)) throw new Error("the server does not say how large the file is");
+    this.keep(Math.max(this.count - TAIL, 0), data);
+  }
+
+  /** Number of blocks. */
+  get count() {
+    return Math.ceil(this.size / BLOCK);
+  }
+
+  /** First byte of a block; that of the first one may lie before the file. */
+  start(n) {
+    return n * BLOCK - (this.count * BLOCK - this.size);
+  }
+
+  /** Keep bytes that begin with block n and end with a block. */
+  keep(n, data) {
+    for (let at = Math.max(this.start(n), 0), from = at; at - from < data.length; n++) {
+      const stop = this.start(n + 1);
+      this.blocks.set(n, data.slice(at - from, stop - from));
+      at = stop;
     }
-    const first = this.size - data.length, cut = (BLOCK - (first % BLOCK)) % BLOCK;
-    if (cut && first) data = data.subarray(cut);
-    for (let at = first ? first + cut : 0, n = 0; n < data.length; at += BLOCK, n += BLOCK) this.blocks.set(at / BLOCK, data.slice(n, n + BLOCK));
   }
 
   ask(range) {
@@ -70,7 +85,7 @@ class Source {
   read(offset, length, to) {
     if (offset < 0 || offset + length > this.size) throw new Error("the file ends before what it promises");
     if (this.bytes) return void to.set(this.bytes.subarray(offset, offset + length));
-    const first = Math.floor(offset / BLOCK), last = Math.floor((offset + length - 1) / BLOCK);
+    const pad = this.count * BLOCK - this.size, first = Math.floor((offset + pad) / BLOCK), last = Math.floor((offset + pad + length - 1) / BLOCK);
     for (let n = first; n <= last; n++) {
       if (this.blocks.has(n)) continue;
       let stop = n + 1;
@@ -79,10 +94,10 @@ class Source {
       if (this.bytes) return this.read(offset, length, to);
     }
     for (let n = first; n <= last; n++) {
-      const block = this.blocks.get(n), from = Math.max(offset - n * BLOCK, 0);
+      const block = this.blocks.get(n), begin = Math.max(this.start(n), 0), from = Math.max(offset - begin, 0);
       this.blocks.delete(n);
       this.blocks.set(n, block);
-      to.set(block.subarray(from, Math.min(offset + length - n * BLOCK, BLOCK)), n * BLOCK + from - offset);
+      to.set(block.subarray(from, Math.min(offset + length - begin, block.length)), begin + from - offset);
     }
     for (const n of this.blocks.keys()) {
       if (this.blocks.size <= Math.max(KEPT, last - first + 2)) break;
@@ -92,11 +107,10 @@ class Source {
 
   /** Load blocks n to stop; who reads on where the last request ended gets more at once. */
   load(n, stop) {
-    const blocks = Math.ceil(this.size / BLOCK);
-    this.ahead = n === this.end ? Math.min(2 * this.ahead, 16) : 1;
-    let until = stop;
-    while (until < Math.min(stop + this.ahead - 1, blocks) && !this.blocks.has(until)) until++;
-    const from = n * BLOCK, end = Math.min(until * BLOCK, this.size);
+    this.ahead = n === this.end ? Math.min(2 * this.ahead, MOST_AHEAD) : 1;
+    while (stop < Math.min(n + this.ahead, this.count) && !this.blocks.has(stop)) stop++;
+    this.end = stop;
+    const from = Math.max(this.start(n), 0), end = this.start(stop);
     let data;
     if (this.blob) {
       data = new Uint8Array(new FileReaderSync().readAsArrayBuffer(this.blob.slice(from, end)));
@@ -110,8 +124,7 @@ class Source {
       }
     }
     if (data.length !== end - from) throw new Error("the server sent other bytes than were asked for; the file may have changed");
-    for (let k = n; k < until; k++) this.blocks.set(k, data.slice((k - n) * BLOCK, (k - n + 1) * BLOCK));
-    this.end = until;
+    this.keep(n, data);
   }
 }
 

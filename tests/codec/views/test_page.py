@@ -748,7 +748,8 @@ def large(folder: Path) -> Path:
         np.exp(-4 * ((x - 0.1 * t) ** 2 + y**2 + (z + 0.05 * t) ** 2))
         + 0.1 * np.sin(9 * x + t) * np.cos(7 * y * z)
         + rng.normal(0, 0.01, (192, 192, 192)).astype(np.float32)
-        for t in range(6)
+        for t in range(12)
     ]
-    fhash_codec.encode(np.stack(frames), path, EncodeConfig(effort=1, max_error=0.003))
+    config = EncodeConfig(effort=1, max_error=0.001, tile="2x48x96x96")
+    fhash_codec.encode(np.stack(frames), path, config)
     return path
