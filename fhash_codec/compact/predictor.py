@@ -22,10 +22,10 @@ from fhash_formats.transform.predict import (
     WEIGHT_UNIT,
     Pass,
     Predictor,
-    encode_predicted,
     integers_of,
     passes_of,
 )
+from fhash_formats.transform.tile import predicted_size
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 ORDERS = ((0, 1, 2, 3), (0, 3, 2, 1), (3, 2, 1, 0))
@@ -214,9 +214,7 @@ def _coded_sizes(tiles: list[IntegerTile], predictor: Predictor) -> list[int]:
     """Return the bytes of each tile, coded by a predictor."""
     with thread_pool() as workers:
         return list(
-            workers.map(
-                lambda tile: len(encode_predicted(tile.integers, tile.counted, predictor)[0]), tiles
-            )
+            workers.map(lambda tile: predicted_size(tile.integers, tile.counted, predictor), tiles)
         )
 
 

@@ -348,7 +348,8 @@ def _predicting(sample: Sample, settings: TileSettings, count: int) -> tuple[flo
 
     count: tiles of the series, from each of which the fit takes some values.
     """
-    from fhash_formats.transform.predict import Predictor, encode_predicted
+    from fhash_formats.transform.predict import Predictor
+    from fhash_formats.transform.tile import predicted_size
 
     step = settings.quantum or settings.step
     with np.errstate(all="ignore"):
@@ -365,7 +366,7 @@ def _predicting(sample: Sample, settings: TileSettings, count: int) -> tuple[flo
         step=step, origin=settings.center, levels=levels, order=order, reach=1, weights=weights
     )
     begun = now()
-    encode_predicted(tile.integers, None, predictor)
+    predicted_size(tile.integers, None, predictor)
     return (now() - begun) / tile.integers.size, fit
 
 

@@ -22,10 +22,9 @@ from fhash_codec.selftest.run import cases
 from fhash_formats.container.reader import Container
 from fhash_formats.transform.chunk import encode_chunk
 from fhash_formats.transform.coder import MaskLevels, encode_block
-from fhash_formats.transform.tile import decode_tile_mask
-from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.predict import encode_differences, encode_predicted
 from fhash_formats.transform.stream import ArrayAxes
+from fhash_formats.transform.tile import Coding, decode_tile_mask, encode_tile
 from fhash_formats.transform.tile_format import DIFFERENCES, TileSettings, seal
 from reference import predictor as reference_predictor
 from reference.tile import chunk_of, decode_tile

@@ -79,6 +79,7 @@ _TILES: Prototypes = {
     "fhash_tile_fill": (*_TILE, ARRAY, ARRAY, ctypes.c_int32, ARRAY, ARRAY),
     "fhash_tile_forward": (*_TILE, *(ARRAY,) * 3),
     "fhash_tile_foretell": (*_TILE, ARRAY, REAL, REAL, ARRAY, ARRAY),
+    "fhash_tile_foretold": (*_TILE, *(ARRAY,) * 4),
     "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
     "fhash_tile_free": (ARRAY,),
     "fhash_tile_bound": (ARRAY,),
@@ -90,6 +91,8 @@ _RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.
 
 PROTOTYPES: Prototypes = {
     **_TILES,
+    "fhash_encode_block": (*(ARRAY,) * 3, INTEGER),
+    "fhash_decode_block": (*_SIZED, ARRAY, ARRAY),
     # coder.cpp
     "fhash_encode": (
         ARRAY,

@@ -1,4 +1,4 @@
-// The table of bands (transform/coder.py): which part of a tile each is, and the earlier bands from
+// The table of bands (coding.hpp): which part of a tile each is, and the earlier bands from
 // which it takes contexts.
 #pragma once
 

@@ -318,14 +318,14 @@ FHASH_TWO_CLONES int64_t decode_two(const Task& task) { return run<DECODE, true>
 
 }  // namespace
 
-// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (transform/lifting.py).
+// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (plan.cpp).
 // Integers outside the bands count as 0.
 //
 // scaled: null, or coefficients / step: then the magnitudes are chosen anew and written to q.
 // lambda: squared steps that a bit is worth.
 // trellis: whether the integers are those of two quantisers; not together with `scaled`.
 // table: (count, COLUMNS).
-// slots, weights, simples: the state (transform/coder.py). It is left adapted if `keep` and
+// slots, weights, simples: the state (priors.hpp). It is left adapted if `keep` and
 // if the bytes fit.
 // data: receives the bytes if they fit the capacity. If they do not, call again with the same q and
 // more room.

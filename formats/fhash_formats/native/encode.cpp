@@ -203,19 +203,9 @@ bool encode_foretold(const Task& task, Coded& coded, fhash_error& error) {
     std::vector<int32_t> integers;
     if (!foretold_integers(task, predictor, integers))
         return encode_task_exactly(task, coded, error);
-    const State& prior = predictor_prior();
-    const std::vector<int32_t> given = integers;
     Buffer body;
-    const auto encode = [&](uint8_t* data, int64_t capacity) {
-        integers = given;
-        return fhash_encode_predicted(
-            integers.data(), task.counts(), task.shape.data(), predictor.levels.data(),
-            predictor.passes.data(), (int64_t)predictor.passes.size() / 4, predictor.taps.data(),
-            predictor.weights.data(), prior.slots.data(), prior.slot_count(), prior.weights.data(),
-            (int64_t)prior.weights.size(), prior.simples.data(), prior.simple_count(), data,
-            capacity);
-    };
-    if (!with_room(task.size(), body, error, encode)) return false;
+    if (!encode_predicted(predictor, task.shape, task.counts(), integers, body, error))
+        return false;
     std::vector<double> linear((size_t)task.size());
     for (size_t i = 0; i < linear.size(); i++) {
         const double value = (double)integers[i] * predictor.step + predictor.origin;
@@ -503,6 +493,22 @@ bool encode_about_origin(Task& task, const uint8_t* in_coreset, Coded& coded, fh
 }
 
 }  // namespace
+
+bool encode_predicted(const Predictor& predictor, const Shape& shape, const uint8_t* counted,
+                      std::vector<int32_t>& integers, Buffer& out, fhash_error& error) {
+    const State& prior = predictor_prior();
+    const std::vector<int32_t> given = integers;
+    const auto encode = [&](uint8_t* data, int64_t capacity) {
+        integers = given;
+        return fhash_encode_predicted(
+            integers.data(), counted, shape.data(), predictor.levels.data(),
+            predictor.passes.data(), (int64_t)predictor.passes.size() / 4, predictor.taps.data(),
+            predictor.weights.data(), prior.slots.data(), prior.slot_count(), prior.weights.data(),
+            (int64_t)prior.weights.size(), prior.simples.data(), prior.simple_count(), data,
+            capacity);
+    };
+    return with_room(vertices(shape), out, error, encode);
+}
 
 Buffer sealed(int flags, const std::vector<Buffer>& sections) {
     Buffer data(4);

@@ -5,7 +5,7 @@
 #include "numbers.hpp"
 #include "tile.hpp"
 
-// Options of the encoder: how hard it works, what it keeps (transform/encoding.py describes them).
+// Options of the encoder: how hard it works, what it keeps (transform/tile.py describes them).
 struct fhash_coding {
     double weight, error;  // error below 0: no bound
     int32_t rounds, rough, passes, filled, density, keep_missing, own_settings, fast;
@@ -56,6 +56,10 @@ struct IntegerCoding {
 bool encode_integers(std::vector<int32_t>& integers, const Shape& shape, const Table& table,
                      const IntegerCoding& how, Buffer& out, fhash_error& error);
 
+// Codes predicted integers, which become what the bytes decode to where they do not count.
+bool encode_predicted(const Predictor& predictor, const Shape& shape, const uint8_t* counted,
+                      std::vector<int32_t>& integers, Buffer& out, fhash_error& error);
+
 // What a search on a tile needs.
 template <class T> struct Search {
     fhash_context& context;
@@ -80,7 +84,7 @@ bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficien
                        const fhash_coding& coding, Buffer& data, std::vector<int32_t>& integers,
                        fhash_error& error);
 
-// `target` with fill values where it is not counted (transform/encoding.py, filled).
+// `target` with fill values where it is not counted (transform/tile.py, filled).
 template <class T>
 bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8_t* finite,
                     int density, std::vector<T>& target, fhash_error& error);

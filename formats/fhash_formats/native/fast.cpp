@@ -20,14 +20,14 @@ Decode* decoder() { return fhash_fast_decode_baseline; }
 
 }  // namespace
 
-// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (transform/lifting.py), or
+// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (plan.cpp), or
 // foretell what that takes. Integers outside the bands count as 0.
 //
 // values, scale, weight: null, or what integers are chosen of: values times scale, in steps, where
 // a bit is worth so many squared steps. q receives them, and must be zeros; without q they are
 // priced.
 // trellis: whether integers are chosen on a trellis of two quantisers.
-// table: (count, COLUMNS). slots, defaults: the prior (transform/coder.py).
+// table: (count, COLUMNS). slots, defaults: the prior (priors.hpp).
 // data: receives the bytes if they fit the capacity. If they do not, call again with more room.
 // results: receives the bytes that are foretold, and where integers are chosen the sum of the
 // squared errors, in squared steps.

@@ -109,7 +109,7 @@ const int REFERENCE[REFERENCE_COUNT] = {4, 12, 4, 3};
 const int REFERENCE_SIDES[REFERENCE_COUNT] = {1, 2, 0, 1};
 const int SIDE = 16;
 
-// The prior (transform/coder.py): a distribution is the slots that each of its symbols has.
+// The prior (priors.hpp): a distribution is the slots that each of its symbols has.
 struct Prior {
     const uint16_t (*slots)[TOKENS];
     const uint8_t* defaults;  // by context

@@ -3,7 +3,7 @@
 // Each bit is predicted by CONTEXTS adaptive estimates that are mixed as in coder.cpp. Contexts
 // come from the bits before it (to the left, above, one layer and one step before) and from two
 // levels of the vertex and of its neighbours, also of those after it: encoder and decoder have the
-// levels from the decoded values (transform/coder.py). Where all segments around
+// levels from the decoded values (mask_levels.cpp). Where all segments around
 // agree, a flag stands for SEGMENT vertices of a row.
 // tests/reference/masks.py explains it.
 #include <cstdlib>
@@ -186,7 +186,7 @@ FHASH_CLONES int64_t decode(MaskCoder<true> coder, uint8_t* mask, const uint8_t*
 // Encode a mask of zeros and ones (t, z, y, x).
 //
 // level, other: two levels of each vertex, 0 to 31 and 0 to 15.
-// slots, weights, simples: the state (transform/coder.py). It is left adapted if `keep` and
+// slots, weights, simples: the state (priors.hpp). It is left adapted if `keep` and
 // if the bytes fit.
 // data: receives the bytes if they fit the capacity.
 //

@@ -122,7 +122,7 @@ struct Simple {
     uint16_t p, count;
 };
 
-// The state that a coder adapts (transform/coder.py). The caller's weights are int32,
+// The state that a coder adapts (priors.hpp). The caller's weights are int32,
 // `lanes` to a set. Here they are int16, which holds all of them, and each set is filled up with
 // zeros to whole vectors.
 struct State {

@@ -244,3 +244,41 @@ FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* t
         return done;
     });
 }
+
+// The bytes that coded integers of a tile take by its predictor. counted: null for all.
+FHASH_EXPORT int32_t fhash_tile_foretold(fhash_context* context, const fhash_tile* tile,
+                                         const int32_t* integers, const uint8_t* counted,
+                                         int64_t* size, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
+            std::vector<int32_t> given(integers, integers + vertices(shape));
+            Buffer data;
+            if (!encode_predicted(*settings->predictor, shape, counted, given, data, failed))
+                return false;
+            *size = (int64_t)data.size();
+            return true;
+        });
+    });
+}
+
+// A block of integers that stands alone; as the kernels, which return sizes and errors.
+FHASH_EXPORT int64_t fhash_encode_block(const int32_t* integers, const int64_t* shape,
+                                        uint8_t* data, int64_t capacity) {
+    fhash_error error;
+    Shape of;
+    std::copy_n(shape, 4, of.begin());
+    std::vector<int32_t> given(integers, integers + vertices(of));
+    Buffer out;
+    if (!encode_integers(given, of, single_band(of), {}, out, error)) return -2;
+    if ((int64_t)out.size() <= capacity) std::copy(out.begin(), out.end(), data);
+    return (int64_t)out.size();
+}
+
+FHASH_EXPORT int64_t fhash_decode_block(const uint8_t* data, int64_t size, const int64_t* shape,
+                                        int32_t* integers) {
+    fhash_error error;
+    Shape of;
+    std::copy_n(shape, 4, of.begin());
+    if (decode_block(data, (size_t)size, of, integers, error)) return 0;
+    return error.status == FHASH_ERROR_MEMORY ? -2 : -1;
+}

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cstdlib>
+#include <new>
 
 #include "inflate.hpp"
 
@@ -28,6 +29,15 @@ const uint16_t PROBABILITIES[44] = {
     32768, 40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097,
     65269, 65374, 65438, 65476, 65500, 65514, 65523, 65528, 65531, 65533, 65534};
 
+// A file of a prior is sound: only memory can be missing.
+[[noreturn]] void no_memory() {
+#if defined(__cpp_exceptions)
+    throw std::bad_alloc();
+#else
+    std::abort();
+#endif
+}
+
 struct Run {
     int64_t count;
     int32_t value;
@@ -52,7 +62,7 @@ void learn(State& state, int file) {
     const size_t slots = state.slots.size() / 4, simples = state.simples.size() / 2;
     std::vector<uint8_t> numbers(slots + simples + state.weights.size());
     fhash_error error;
-    if (!inflate_exact(packed, size, true, numbers.data(), numbers.size(), error)) std::abort();
+    if (!inflate_exact(packed, size, true, numbers.data(), numbers.size(), error)) no_memory();
     const uint8_t* at = numbers.data();
     for (size_t i = 0; i < slots; i++, at++) {
         state.slots[4 * i] = state.slots[4 * i + 1] = PROBABILITIES[*at];
@@ -113,7 +123,6 @@ constexpr int CHOICES = 64, TOKENS = 16, CONTEXTS = 1744, UNIT = 2048;
 FastPrior make_fast() {
     size_t size;
     const uint8_t* const data = prior_bytes(2, &size);
-    if (size != 2 * CHOICES * TOKENS + CONTEXTS) std::abort();
     FastPrior prior;
     prior.slots.assign((2 * CHOICES + 1) * TOKENS, 0);
     for (int i = 0; i < CHOICES * TOKENS; i++)
@@ -132,7 +141,6 @@ FastPrior make_fast() {
             for (uint32_t place = 0; place < count; place++)
                 prior.lookup.push_back(symbol | place << 4 | count << 16);
         }
-    if (prior.lookup.size() != (2 * CHOICES + 1) * UNIT) std::abort();
     return prior;
 }
 

@@ -16,7 +16,9 @@ template <class Work> void together(int count, Work work) {
 
 #else
 
+#include <atomic>
 #include <mutex>
+#include <new>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -25,17 +27,28 @@ namespace fhash {
 using Mutex = std::mutex;
 using Guard = std::lock_guard<std::mutex>;
 
-// Runs `work`, which throws nothing, for each number from 0 to before `count`, each in a thread.
+// Runs `work` for each number from 0 to before `count`, each in a thread. Throws std::bad_alloc
+// where one of them has no memory.
 template <class Work> void together(int count, Work work) {
+    std::atomic<bool> failed{false};
+    const auto run = [&](int number) {
+        try {
+            work(number);
+        } catch (...) {  // of the standard library alone: no memory
+            failed = true;
+        }
+    };
     std::vector<std::thread> threads;
+    threads.reserve((size_t)count);
     int i = 1;
     try {
-        for (; i < count; i++) threads.emplace_back(work, i);
+        for (; i < count; i++) threads.emplace_back(run, i);
     } catch (const std::system_error&) {  // no further thread: this one does the rest
     }
-    for (int rest = i; rest < count; rest++) work(rest);
-    if (count > 0) work(0);
+    for (int rest = i; rest < count; rest++) run(rest);
+    run(0);
     for (std::thread& thread : threads) thread.join();
+    if (failed) throw std::bad_alloc();
 }
 }  // namespace fhash
 

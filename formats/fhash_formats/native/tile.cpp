@@ -146,7 +146,6 @@ bool decode_labelled(const Job& job, O* values, uint8_t* occupied, fhash_error& 
 // What all kinds with settings share at last: vertices without a value, missing values.
 template <class O>
 bool finish(const Job& job, O* values, const uint8_t* occupied, fhash_error& error) {
-    if (job.lod) return true;
     if (occupied) blank(values, job.size(), occupied, job.settings->center);
     const Bytes& missing = job.stream.missing;
     if (!missing.at || !missing.left()) return true;
@@ -161,15 +160,17 @@ bool finish(const Job& job, O* values, const uint8_t* occupied, fhash_error& err
     }
 }
 
-template <class O>
-bool decode_empty(const Job& job, O* values, uint8_t* occupied, fhash_error& error) {
-    std::fill_n(values, vertices(job.out_shape()), cast<O>(job.settings->center));
-    if (job.stream.masked && !job.lod) std::fill_n(occupied, job.size(), (uint8_t)0);
-    return finish(job, values, job.stream.masked ? occupied : nullptr, error);
+// Values in the type of the array, within the range of the settings.
+template <class T> void cast_within(const Job& job, const T* in, int64_t n, void* out) {
+    with_type(job.coded_type(), [&](auto type) {
+        auto* const values = (decltype(type)*)out;
+        if ((const void*)in != out) cast_all(in, values, n);
+        clip_range(values, n, *job.settings);
+        return true;
+    });
 }
 
-template <class O>
-bool decode_foretold(const Job& job, O* values, uint8_t* occupied, fhash_error& error) {
+bool decode_foretold(const Job& job, void* values, uint8_t* occupied, fhash_error& error) {
     const Settings& settings = *job.settings;
     if (!settings.predictor)
         return fail(error, FHASH_ERROR_DAMAGED,
@@ -183,8 +184,7 @@ bool decode_foretold(const Job& job, O* values, uint8_t* occupied, fhash_error& 
                               integers.data(), error))
             return false;
         for (int64_t i = 0; i < n; i++) {
-            const double value =
-                (double)integers[(size_t)i] * predictor.step + predictor.origin;
+            const double value = (double)integers[(size_t)i] * predictor.step + predictor.origin;
             const double raised = value < settings.low ? settings.low : value;
             linear[(size_t)i] = raised > settings.high ? settings.high : raised;
         }
@@ -192,17 +192,15 @@ bool decode_foretold(const Job& job, O* values, uint8_t* occupied, fhash_error& 
     if (job.lod) {
         std::vector<double> some((size_t)vertices(job.out_shape()));
         thin(linear.data(), job.shape, job.lod, some.data());
-        cast_all(some.data(), values, (int64_t)some.size());
-        clip_range(values, (int64_t)some.size(), settings);
+        cast_within(job, some.data(), (int64_t)some.size(), values);
         return true;
     }
     const bool masked = job.stream.mask.at;
     if (masked && !(settings.real64 ? read_mask_by<double>(job, linear.data(), occupied, error)
                                     : read_mask_by<float>(job, linear.data(), occupied, error)))
         return false;
-    cast_all(linear.data(), values, n);
-    clip_range(values, n, settings);
-    return finish(job, values, masked ? occupied : nullptr, error);
+    cast_within(job, linear.data(), n, values);
+    return true;
 }
 
 // The quantised coefficients and the residual of a transformed tile, the two at once where there
@@ -236,45 +234,48 @@ bool read_integers(const Job& job, const Table& table, int32_t* coefficients,
     return done[0] && done[1];
 }
 
-// Values with head and residual in the type of the array, from those before. base: float where the
-// settings have a head; may be `values`.
-template <class T, class O>
-bool correct_values(const Job& job, T* base, const std::vector<int32_t>& residual, O* values,
-                    fhash_error& error) {
+// Values with their head, from those before; in other room than `base` where there are threads.
+bool correct_by_head(const Job& job, float*& base, std::vector<float>& room, fhash_error& error) {
+    if (!job.settings->head) return true;
+    // Threads read the rows of others around theirs, so that they need another array.
+    if (job.context.threads > 1) room.resize((size_t)job.size());
+    float* const out = job.context.threads > 1 ? room.data() : base;
+    if (!apply_head(job.context, *job.settings->head, base, job.shape, out, error)) return false;
+    base = out;
+    return true;
+}
+bool correct_by_head(const Job&, double*&, std::vector<double>&, fhash_error&) { return true; }
+
+// Values with their residual in the type of the array, within the range. base: may be `values`.
+template <class T>
+bool add_residual(const Job& job, const T* base, const std::vector<int32_t>& residual,
+                  double largest, void* values, fhash_error& error) {
     const Settings& settings = *job.settings;
     const int64_t n = job.size();
-    std::vector<T> other;
-    if constexpr (std::is_same<T, float>::value) {
-        if (settings.head) {
-            // Threads read the rows of others around theirs, so that they need another array.
-            if (job.context.threads > 1) other.resize((size_t)n);
-            T* const out = job.context.threads > 1 ? other.data() : base;
-            if (!apply_head(job.context, *settings.head, base, job.shape, out, error)) return false;
-            base = out;
-        }
-    }
-    if (residual.empty()) {
-        if ((void*)base != (void*)values) cast_all(base, values, n);
-        return true;
-    }
-    if constexpr (std::is_floating_point<O>::value) {
-        correct(base, residual.data(), n, settings.quantum, values);
+    const bool may_exceed = !settings.clip && settings.quantum * 0x1p31 > largest / 2;
+    bool exceeds = false;
+    const auto finish_sums = [&](auto* sums) {
+        correct(base, residual.data(), n, settings.quantum, sums);
+        for (int64_t i = 0; may_exceed && i < n; i++) exceeds |= std::isinf(sums[i]);
+        cast_within(job, sums, n, values);
+    };
+    if (job.coded_type() == FHASH_FLOAT32) {
+        finish_sums((float*)values);
     } else {
         std::vector<double> sums((size_t)n);
-        correct(base, residual.data(), n, settings.quantum, sums.data());
-        cast_all(sums.data(), values, n);
+        finish_sums(sums.data());
+        if (may_exceed && job.coded_type() == FHASH_FLOAT16)
+            for (const double sum : sums) exceeds |= (to_half(sum) & 0x7fff) == 0x7c00;
     }
+    // Without a residual the values are within the range, and finite; clipped ones are in the end.
+    if (exceeds && job.coded_type() >= FHASH_FLOAT16)
+        return fail(error, FHASH_ERROR_DAMAGED, "a residual of a coded tile is beyond %.6g",
+                    largest);
     return true;
 }
 
-template <class O> bool any_infinite(const O* values, int64_t n) {
-    for (int64_t i = 0; i < n; i++)
-        if (std::isinf(real(values[i]))) return true;
-    return false;
-}
-
-template <class T, class O>
-bool decode_transformed(const Job& job, O* values, uint8_t* occupied, double largest,
+template <class T>
+bool decode_transformed(const Job& job, void* values, uint8_t* occupied, double largest,
                         fhash_error& error) {
     const Settings& settings = *job.settings;
     const auto plan = plan_for<T>(job.context, settings, job.shape, job.lod, error);
@@ -282,43 +283,51 @@ bool decode_transformed(const Job& job, O* values, uint8_t* occupied, double lar
     const int64_t n = job.size(), count = vertices(job.out_shape());
     std::vector<int32_t> residual((size_t)(job.stream.residual.at && !job.lod ? n : 0));
     // Where the sizes are the same, integers, values before the head, and values share the room.
-    constexpr bool in_place = std::is_same<T, float>::value && std::is_same<O, float>::value;
-    const bool direct = in_place && !job.lod;
+    constexpr bool narrow = std::is_same<T, float>::value;
+    const bool direct = narrow && job.coded_type() == FHASH_FLOAT32 && !job.lod;
     std::vector<int32_t> integers((size_t)(direct ? 0 : n));
-    int32_t* const coefficients = direct ? (int32_t*)(void*)values : integers.data();
+    int32_t* const coefficients = direct ? (int32_t*)values : integers.data();
     if (!read_integers(job, plan->table, coefficients, residual, error)) return false;
-    const bool over = std::is_same<T, float>::value && !job.lod;
-    std::vector<T> room((size_t)(over ? 0 : count));
-    T* const linear = over ? (T*)(void*)coefficients : room.data();
+    const bool over = narrow && !job.lod;
+    std::vector<T> room((size_t)(over ? 0 : count)), corrected;
+    T* linear = over ? (T*)(void*)coefficients : room.data();
     if (!linear_values(settings, *plan, coefficients, linear, error)) return false;
     if (job.lod) {
-        cast_all(linear, values, count);
-        clip_range(values, count, settings);
+        cast_within(job, linear, count, values);
         return true;
     }
-    const bool masked = job.stream.mask.at;
-    if (masked && !read_mask_by<T>(job, linear, occupied, error)) return false;
-    if (!correct_values(job, linear, residual, values, error)) return false;
-    // Without a residual the values are within the range, and finite; clipped ones are in the end.
-    if constexpr (is_real<O>) {
-        const bool may_exceed = !settings.clip && settings.quantum * 0x1p31 > largest / 2;
-        if (!residual.empty() && may_exceed && any_infinite(values, n))
-            return fail(error, FHASH_ERROR_DAMAGED, "a residual of a coded tile is beyond %.6g",
-                        largest);
-    }
-    clip_range(values, n, settings);
-    return finish(job, values, masked ? occupied : nullptr, error);
+    if (job.stream.mask.at && !read_mask_by<T>(job, linear, occupied, error)) return false;
+    if (!correct_by_head(job, linear, corrected, error)) return false;
+    if (!residual.empty()) return add_residual(job, linear, residual, largest, values, error);
+    cast_within(job, linear, n, values);
+    return true;
 }
 
-template <class O>
-bool decode_coded(const Job& job, O* values, uint8_t* occupied, fhash_error& error) {
+// The values of a tile with settings, but for labels.
+bool decode_coded(const Job& job, void* values, uint8_t* occupied, fhash_error& error) {
+    const Settings& settings = *job.settings;
     double largest;
-    if (!check_numbers(*job.settings, job.coded_type(), largest, error)) return false;
-    if (job.stream.kind == EMPTY) return decode_empty(job, values, occupied, error);
-    if (job.stream.kind == PREDICTED) return decode_foretold(job, values, occupied, error);
-    if (job.settings->real64)
-        return decode_transformed<double>(job, values, occupied, largest, error);
-    return decode_transformed<float>(job, values, occupied, largest, error);
+    if (!check_numbers(settings, job.coded_type(), largest, error)) return false;
+    const int kind = job.stream.kind;
+    bool done = true;
+    if (kind == EMPTY) {
+        if (job.stream.masked && !job.lod) std::fill_n(occupied, job.size(), (uint8_t)0);
+        with_type(job.coded_type(), [&](auto type) {
+            using O = decltype(type);
+            std::fill_n((O*)values, vertices(job.out_shape()), cast<O>(settings.center));
+            return true;
+        });
+    } else if (kind == PREDICTED) {
+        done = decode_foretold(job, values, occupied, error);
+    } else {
+        done = settings.real64 ? decode_transformed<double>(job, values, occupied, largest, error)
+                               : decode_transformed<float>(job, values, occupied, largest, error);
+    }
+    if (!done || job.lod) return done;
+    const bool masked = job.stream.mask.at || (kind == EMPTY && job.stream.masked);
+    return with_type(job.coded_type(), [&](auto type) {
+        return finish(job, (decltype(type)*)values, masked ? occupied : nullptr, error);
+    });
 }
 
 template <class O>

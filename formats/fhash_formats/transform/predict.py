@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import struct
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from fhash_formats import native
-from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.errors import InputError
 from fhash_formats.support.arrays import Integers, Mask, Values
-from fhash_formats.transform.coder import (
-    Buffer,
-    State,
-    array_arguments,
-    checked,
-    state_arguments,
-    with_room,
-)
-from fhash_formats.transform.values import ZSTD_LEVEL, from_zstd, pieces
+from fhash_formats.transform.values import ZSTD_LEVEL, pieces
 
 CLASSES = 16
 """Kinds of passes, each with statistics of its own.
@@ -135,28 +124,6 @@ def passes_of(levels: Axes, order: Axes, reach: int) -> tuple[Pass, ...]:
     return (first, *others)
 
 
-def pass_arrays(
-    predictor: Predictor,
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], npt.NDArray[np.int16]]:
-    """The passes as the native coder takes them.
-
-    Returns:
-        Passes, int32 (n, 4): axis, kind, number of the first tap, number of taps.
-        Taps of all passes, int32 (m, 5), see `Tap`.
-        Weights of the taps, int16 (m,).
-    """
-    rows: list[tuple[int, ...]] = []
-    taps: list[Tap] = []
-    for a_pass in predictor.passes:
-        rows.append((a_pass.axis, a_pass.kind, len(taps), len(a_pass.taps)))
-        taps += a_pass.taps
-    return (
-        np.array(rows, dtype=np.int32),
-        np.array(taps, dtype=np.int32),
-        np.array(predictor.weights, dtype=np.int16),
-    )
-
-
 def _at(lattice: int, *moves: tuple[int, int]) -> Tap:
     """The tap of a lattice at these moves, each an axis and an offset along it."""
     offsets = dict(moves)
@@ -221,26 +188,6 @@ def _are_integers(values: Any, count: int, low: int, high: int) -> bool:
 
 MAX_PREDICTED_INTEGER = 1 << 27
 """Largest magnitude of an integer that is coded by prediction."""
-DECISIONS = 16
-"""Decisions of a difference, each with estimates and weights of its own."""
-LANES = 14
-"""Weights of a set."""
-LEVELS = 48
-"""Levels of the expected difference; each has a set of weights per decision."""
-SIZES = (LEVELS * 5, 32 * 27, CLASSES * 24 * 5, 3125, 81 * 5 * 8, 81 * 24, 32 * 24 * 5)
-"""Contexts of each of the seven estimates that are mixed; each context has a slot per decision."""
-SIMPLES = 200
-"""Simple estimates: of low bits, of the escape code and of rows without a difference."""
-
-
-@cache
-def blank_state() -> State:
-    """A state that has learned nothing: even odds, and weights that believe the estimates.
-
-    The arrays are read-only.
-    """
-    weights = [(CLASSES * DECISIONS * LANES, 4096), (LEVELS * DECISIONS * LANES, 0)]
-    return State.even(slots=sum(SIZES) * DECISIONS, weights=weights, simples=SIMPLES).frozen()
 
 
 def integers_of(values: Values, counted: Mask | None, predictor: Predictor) -> Integers | None:
@@ -265,78 +212,6 @@ def integers_of(values: Values, counted: Mask | None, predictor: Predictor) -> I
             return None
         out[piece] = nearest
     return result
-
-
-def values_of(integers: Integers, predictor: Predictor) -> npt.NDArray[np.float64]:
-    """The values origin + step * integer, float64: one product, one sum."""
-    with np.errstate(all="ignore"):
-        values = integers * np.float64(predictor.step)
-        values += np.float64(predictor.origin)
-    return values
-
-
-def encode_predicted(
-    integers: Integers, counted: Mask | None, predictor: Predictor
-) -> tuple[bytes, Integers]:
-    """Code integers: the bytes, and the integers that they decode to.
-
-    Args:
-        integers: (t, z, y, x), each within +-MAX_PREDICTED_INTEGER.
-        counted: mask (bool, same shape) of the integers that must come back; the others become
-            their predictions. None counts all.
-        predictor: the passes and their weights.
-    """
-    marks = None if counted is None else np.ascontiguousarray(counted, dtype=np.uint8)
-    result = np.empty(integers.shape, dtype=np.int32)
-
-    def encode(buffer: Buffer) -> int:
-        np.copyto(result, integers)
-        code: int = native.library().fhash_encode_predicted(
-            result.ctypes.data,
-            None if marks is None else marks.ctypes.data,
-            *_geometry(integers.shape, predictor),
-            *state_arguments(blank_state()),
-            *array_arguments(buffer),
-        )
-        return code
-
-    return with_room(integers.size, encode), result
-
-
-def decode_predicted(
-    data: bytes | memoryview, shape: tuple[int, ...], predictor: Predictor
-) -> Integers:
-    """The integers (t, z, y, x) of a shape, int32.
-
-    Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
-    """
-    integers = np.zeros(shape, dtype=np.int32)
-    source = np.frombuffer(data, dtype=np.uint8)
-    code = native.library().fhash_decode_predicted(
-        integers.ctypes.data,
-        *_geometry(shape, predictor),
-        *state_arguments(blank_state()),
-        *array_arguments(source),
-    )
-    if checked(code) < 0:
-        raise DamagedFileError("the predicted integers of a tile are damaged")
-    return integers
-
-
-def _geometry(shape: tuple[int, ...], predictor: Predictor) -> list[Any]:
-    """Shape, levels, passes, taps and weights as the native functions take them.
-
-    The pointers keep their arrays alive.
-    """
-    passes, taps, weights = pass_arrays(predictor)
-    four = ctypes.c_int64 * 4
-    return [
-        four(*shape),
-        four(*predictor.levels),
-        *array_arguments(passes),
-        taps.ctypes.data_as(ctypes.c_void_p),
-        weights.ctypes.data_as(ctypes.c_void_p),
-    ]
 
 
 MAX_ORDER = 6
@@ -366,14 +241,6 @@ def _planes(tile: Values) -> Values:
     return tile.reshape(t * z, y, x)
 
 
-def _tile(planes: Values, shape: Axes) -> Values:
-    """The tile of a shape that has these planes; the inverse of `_planes`."""
-    t, z, y, x = shape
-    if x <= _CORNERS < y:
-        return np.ascontiguousarray(planes.reshape(t, x, z, y).transpose(0, 2, 3, 1))
-    return planes.reshape(shape)
-
-
 def _ordered(words: Values) -> Values:
     """Integers in the order of the floats whose bits are `words`, or the other way round."""
     signs: Values = words >> (8 * words.itemsize - 1)
@@ -387,45 +254,10 @@ def _bytes(planes: Values) -> bytes:
     return words.view(np.uint8).reshape(-1, words.itemsize).T.tobytes()
 
 
-def _integers(data: npt.NDArray[np.uint8], shape: tuple[int, ...], size: int) -> Values:
-    """Integers of `size` bytes; the inverse of `_bytes`."""
-    words = np.ascontiguousarray(data.reshape(size, -1).T).view(f"<u{size}").reshape(shape)
-    words = words.astype(f"u{size}", copy=False)
-    return ((words >> 1) ^ -(words & 1)).view(f"i{size}")
-
-
 def _rounded(integers: Values, scale: float, kind: np.dtype[Any]) -> Values:
     """The ordered floats of integers in a unit of 1 / scale."""
     with np.errstate(over="ignore"):
         return _ordered((integers.astype(np.float64) / scale).astype(kind).view(integers.dtype))
-
-
-def decode_differences(data: memoryview, shape: Axes, dtype: np.dtype[Any]) -> Values:
-    """The tile (t, z, y, x) that `encode_differences` coded. Raises DamagedFileError."""
-    grid = _planes(np.broadcast_to(np.int8(0), shape)).shape
-    count, marks = math.prod(shape), -(-math.prod(shape) // 8)
-    found = from_zstd(data, _FRONT.size, _FRONT.size + 2 * count * dtype.itemsize + marks)
-    flags, scale, hole, order = _FRONT.unpack_from(found.data)
-    holes, rests, narrow = (bool(flags & flag) for flag in (_HOLES, _RESTS, _NARROW))
-    kind = np.dtype(np.float32) if narrow and dtype == np.float64 else dtype
-    size = kind.itemsize
-    lengths = [count * size, count * size * rests, marks * holes]
-    sound = len(found) == _FRONT.size + sum(lengths) and hole >> 8 * size == 0
-    sound = sound and max(divmod(order, 16)) <= MAX_ORDER and flags < 2 * _NARROW
-    sound = sound and (0 < scale < math.inf if kind.kind == "f" else flags == 0 == scale)
-    if not sound or narrow is (kind == dtype):
-        raise DamagedFileError("a tile of differences has numbers that no encoder writes")
-    first, rest, last = np.split(found[_FRONT.size :], np.cumsum(lengths[:2]))
-    words = _integers(first, grid, size)
-    for axis, sums in enumerate(divmod(order, 16), start=1):
-        for _ in range(sums):
-            np.cumsum(words, axis, words.dtype, words)
-    if kind.kind == "f":
-        words = _rounded(words, scale, kind)
-        words = _ordered(words + _integers(rest, grid, size) if rests else words)
-    if holes:
-        words.view(f"u{size}")[np.unpackbits(last, count=count).reshape(grid).view(bool)] = hole
-    return _tile(words.view(kind), shape).astype(dtype, copy=False)
 
 
 def encode_differences(tile: Values) -> bytes | None:

@@ -17,13 +17,14 @@ from fhash_formats.transform.tile import (
     decode_tile,
     decode_tile_mask,
     decode_tile_table,
+    encode_tile,
+    exact_tile,
     uncorrected,
 )
 from fhash_formats.transform.tile_format import (
     DIFFERENCES,
     Shape,
     TileSettings,
-    build_exact_stream,
     parse_stream,
     seal,
 )
@@ -181,13 +182,11 @@ class TransformCoder:
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk, which keeps every bit where there are no settings."""
-        from fhash_formats.transform.tile import encode_tile  # which a decoder does without
-
         tile = chunk.reshape(self._tile_shape) if self.axes is None else self.axes.to_tile(chunk)
         if self.settings is not None:
             return encode_tile(tile, self.settings).data
         body = encode_differences(np.ascontiguousarray(tile, self._dtype))
-        return build_exact_stream(tile, None, None) if body is None else seal(DIFFERENCES, [body])
+        return exact_tile(tile).data if body is None else seal(DIFFERENCES, [body])
 
     def check(self, data: memoryview | bytes) -> None:
         """Raises DamagedFileError for a stream that is damaged."""

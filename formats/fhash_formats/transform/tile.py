@@ -13,8 +13,10 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Mask, Values
+from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.support.threads import usable_threads
+from fhash_formats.transform.predict import Predictor
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import Shape, TileSettings
 from fhash_formats.transform.values import about_origin, at_origin
 
@@ -396,6 +398,26 @@ def foretell(
     tile = _tile_of(coefficients, settings)
     _call("fhash_tile_foretell", tile, _pointer(coefficients), scale, weight, results)
     return results[0], results[1]
+
+
+def predicted_size(integers: Integers, counted: Mask | None, predictor: Predictor) -> int:
+    """The bytes that integers of a tile (t, z, y, x) take where a predictor codes them.
+
+    counted: the integers that must come back, a mask; None for all.
+    """
+    settings = TileSettings(
+        transform=TransformSpec(axes=(AxisTransform(kind="none"),) * 4),
+        step=1.0,
+        center=0.0,
+        low=0.0,
+        high=0.0,
+        predictor=predictor,
+    )
+    given, size = np.ascontiguousarray(integers, np.int32), ctypes.c_int64()
+    mask = None if counted is None else np.ascontiguousarray(counted, np.bool_)
+    pointers = (_pointer(given), None if mask is None else _pointer(mask), ctypes.byref(size))
+    _call("fhash_tile_foretold", _tile_of(given, settings), *pointers)
+    return size.value
 
 
 def _lod_shape(shape: Shape, lod: int) -> tuple[int, ...]:

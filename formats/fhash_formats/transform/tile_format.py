@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import struct
 import sys
-import zlib
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -14,28 +13,21 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.support.arrays import Integers, Mask, Values
+from fhash_formats.support.arrays import Values
 from fhash_formats.support.values import is_wide_integer, is_within
 from fhash_formats.transform.coder import (
-    MAX_LABELS,
-    Levels,
     MaskLevels,
     decode_block,
-    decode_labels,
-    decode_mask,
     encode_block,
-    encode_integers,
-    encode_labels,
-    encode_mask,
-    single_band,
 )
 from fhash_formats.transform.head import NeighbourHead
 from fhash_formats.transform.predict import Predictor, tap_count
 from fhash_formats.transform.spec import KINDS, AxisTransform, Basis, TransformSpec
-from fhash_formats.transform.values import OFFSET_UNIT
 
 OFFSETS = 6
 """Reconstruction offsets."""
+OFFSET_UNIT = 128
+"""Units in a quantiser step, for reconstruction offsets."""
 _DOUBLE, _CLIP, _LABELS, _TRELLIS, _WHOLE, _HEAD, _MASK, _PREDICTOR = (1 << n for n in range(8))
 """Flags of a packed block."""
 _OTHERS = 128
@@ -420,71 +412,6 @@ def seal(flags: int, sections: list[bytes]) -> bytes:
     return crc32c(data).to_bytes(_CHECKSUM, "little") + data
 
 
-def build_stream(
-    kind: int,
-    settings: TileSettings | None,
-    missing: bytes = b"",
-    body: bytes = b"",
-    residual: Integers | None = None,
-    mask: bytes | None = None,
-    *,
-    fast: bool = False,
-) -> bytes:
-    """The stream of a tile.
-
-    Args:
-        kind: TRANSFORMED, PREDICTED or EMPTY.
-        settings: the tile's own settings; None for none.
-        missing: section of missing values; empty for none.
-        body: section of coded coefficients or predicted integers.
-        residual: residual in quanta; None for none.
-        mask: section of the mask; None for a stream without one.
-        fast: whether the body is, and the residual shall be, of the fast coder.
-    """
-    flags, sections = _head(kind, settings, mask is not None)
-    flags |= FAST if fast else 0
-    if missing:
-        flags |= MISSING
-        sections.append(missing)
-    if kind != EMPTY:
-        sections.append(body)
-    if residual is not None:
-        flags |= RESIDUAL
-        sections.append(encode_integers(residual, single_band(residual.shape), fast=fast).data)
-    if mask is not None and kind != EMPTY:
-        sections.append(mask)
-    return seal(flags, sections)
-
-
-def build_exact_stream(
-    values: Values, settings: TileSettings | None, occupied: Mask | None
-) -> bytes:
-    """The stream of a tile stored without loss.
-
-    Args:
-        values: the tile (t, z, y, x).
-        settings: the tile's own settings; None for none.
-        occupied: the mask; None for a stream without one.
-    """
-    flags, sections = _head(EXACT, settings, occupied is not None)
-    sections.append(pack_planes(values))
-    if occupied is not None:
-        sections.append(pack_mask(occupied, zero_levels(values.shape)))
-    return seal(flags, sections)
-
-
-def build_labelled_stream(body: bytes, settings: TileSettings | None, *, masked: bool) -> bytes:
-    """The stream of a tile of labels. body: the section of palette and labels."""
-    flags, sections = _head(LABELS, settings, masked)
-    return seal(flags, [*sections, body])
-
-
-def _head(kind: int, settings: TileSettings | None, masked: bool) -> tuple[int, list[bytes]]:
-    """The first flags and sections of a stream."""
-    flags = kind | (MASKED if masked else 0)
-    return (flags, []) if settings is None else (flags | OWN, [settings.to_bytes()])
-
-
 def parse_stream(data: bytes | memoryview) -> TileStream:
     """The flags and sections of a stream.
 
@@ -531,69 +458,6 @@ def _sections(data: memoryview, count: int) -> list[memoryview]:
     return [*found, data] if count else found
 
 
-def pack_planes(values: Values) -> bytes:
-    """The bytes of values of any shape: those of equal weight together, lowest first, deflated."""
-    plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-    planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
-    return zlib.compress(planes.tobytes(), 6)
-
-
-def unpack_planes(data: bytes | memoryview, count: int, dtype: np.dtype[Any]) -> Values:
-    """So many values that `pack_planes` packed, one axis. Raises DamagedFileError."""
-    size = count * dtype.itemsize
-    try:
-        inflate = zlib.decompressobj()
-        plain = inflate.decompress(data, size + 1)  # one more, so that it comes to the end
-    except zlib.error as error:
-        raise DamagedFileError(f"a coded tile is damaged: {error}") from error
-    if len(plain) != size or not inflate.eof or inflate.unused_data:
-        raise DamagedFileError("a coded tile is damaged: it holds another number of values")
-    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-    found = np.array(planes.T, order="C").view(dtype.newbyteorder("<")).reshape(-1)
-    return found.astype(dtype, copy=False)
-
-
-def pack_missing(values: Values, finite: Mask) -> bytes:
-    """The section of missing values. finite: where the values are finite."""
-    marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3)))
-    return encode_labels(marks, _MARKS)
-
-
-def restore_missing(decoded: Values, missing: bytes | memoryview | None) -> Values:
-    """Put the missing values of a section into decoded values, in place.
-
-    missing: the section; empty or None where nothing is missing. Raises DamagedFileError.
-    """
-    if missing:
-        if decoded.dtype.kind != "f":
-            raise DamagedFileError("a coded tile of integers has missing values")
-        marks = decode_labels(missing, _MARKS, decoded.shape)
-        for mark, value in enumerate(_MISSING_VALUES, start=1):
-            decoded[marks == mark] = value
-    return decoded
-
-
-def zero_levels(shape: tuple[int, ...]) -> tuple[Levels, Levels]:
-    """Levels of a mask that no decoded values say anything about."""
-    return np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-
-
-def pack_mask(occupied: Mask, levels: tuple[Levels, Levels]) -> bytes:
-    """The section of a mask; empty where all values are occupied.
-
-    levels: how likely each value is occupied (`MaskLevels.levels`).
-    """
-    if occupied.all():
-        return b""
-    # The decoder reads zeros past the end, so one zero stands for an empty code.
-    return encode_mask(occupied, levels) or b"\0"
-
-
-def unpack_mask(packed: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
-    """The mask in a section."""
-    return decode_mask(packed, levels) if len(packed) else np.ones(levels[0].shape, bool)
-
-
 FEW = 256
 """Labels that are tried whether or not values lie in regions."""
 REGION_SHARE = 0.5
@@ -618,58 +482,3 @@ def surely_exceeds(values: Values, most: int) -> bool:
     """
     flat = values.reshape(-1)
     return bool(np.unique(flat[:: max(1, flat.size // _LOOK)]).size > most)
-
-
-def labelled_stream(
-    values: Values,
-    settings: TileSettings | None,
-    occupied: Mask | None,
-    most: int = MAX_LABELS,
-) -> bytes | None:
-    """The stream of a tile; None for one of too many different values.
-
-    Args:
-        values: the tile (t, z, y, x).
-        settings: the tile's own settings; None for none.
-        occupied: the mask; None for a stream without one. The other values are not stored.
-        most: labels that there may be.
-    """
-    bits = np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}").reshape(-1)
-    kept = bits if occupied is None else bits[occupied.reshape(-1)]
-    if surely_exceeds(kept, most):
-        return None
-    palette = np.unique(kept)
-    count = palette.size + (occupied is not None)
-    if count > most:
-        return None
-    labels = np.searchsorted(palette, bits).astype(np.uint16)
-    if occupied is not None:
-        labels[~occupied.reshape(-1)] = palette.size
-    packed = pack_planes(np.diff(palette, prepend=palette.dtype.type(0)))
-    body = [varint(palette.size), varint(len(packed)), packed]
-    body.append(encode_labels(labels.reshape(values.shape), count))
-    return build_labelled_stream(b"".join(body), settings, masked=occupied is not None)
-
-
-def unpack_labelled(
-    body: memoryview, shape: Shape, dtype: np.dtype[Any], *, masked: bool
-) -> tuple[Values, Mask | None]:
-    """The values in a section, and which are occupied; None without a mask.
-
-    Values that are not occupied are arbitrary. Raises DamagedFileError.
-    """
-    size, body = read_varint(body)
-    length, body = read_varint(body)
-    count = size + masked
-    if not 1 <= count <= MAX_LABELS:
-        raise DamagedFileError(f"a coded tile has {count} labels; 1 to {MAX_LABELS} are possible")
-    if length > len(body):
-        raise DamagedFileError("a coded tile is cut short")
-    steps = unpack_planes(body[:length], size, np.dtype(f"u{dtype.itemsize}"))
-    palette = np.cumsum(steps, dtype=steps.dtype)
-    if (palette[1:] <= palette[:-1]).any():
-        raise DamagedFileError("the palette of a coded tile does not ascend")
-    labels = decode_labels(body[length:], count, shape)
-    # The label of unoccupied vertices has no value: any stands there.
-    values = np.append(palette, np.zeros(1, palette.dtype))[labels].view(dtype)
-    return values, labels < size if masked else None

@@ -1,4 +1,4 @@
-"""Transform of a tile, the norms of its coefficients and their order in bands."""
+"""Transform of the native library by ctypes, for tests that look at one kernel alone."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from numpy.typing import DTypeLike, NDArray
 from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.support.arrays import Integers, Values
-from fhash_formats.transform.coder import COLUMNS, NO_REFERENCE, Table
 from fhash_formats.transform.spec import AXES, KINDS, AxisTransform, TransformSpec
+from reference.kernels import COLUMNS, NO_REFERENCE, Table
 
 MAX_EXACT = 512
 """Longest axis, in vertices, whose norms are computed at each position."""
