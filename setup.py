@@ -69,6 +69,7 @@ WASM = Path("fhash_codec/views/page/fhash.wasm")
 WASM_FLAGS = [
     "--target=wasm32-wasi",
     "-msimd128",
+    "-DFHASH_SMALL",
     "-ffp-contract=off",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -77,8 +78,6 @@ WASM_FLAGS = [
     "-flto",
     "-g0",
 ]
-WASM_KERNELS = {"coder", "fast", "head", "lifting", "predict"}
-"""Sources that most of the time is spent in; all others are compiled for size."""
 WASM_SMALL = [
     ("HUF_FORCE_DECOMPRESS_X1", "1"),
     ("ZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT", "1"),
@@ -192,8 +191,9 @@ class BuildWasm(Command):
             result = build / f"{source.name}.o"
             if result.exists() and result.stat().st_mtime > max(source.stat().st_mtime, headers):
                 return result
-            kind = [f"-D{name}={value}" for name, value in [*THIRD_PARTY, *WASM_SMALL]]
-            kind += ["-Os"] if source.stem in WASM_KERNELS else ["-Oz", "-DFHASH_SMALL"]
+            # Most of the time of a first picture goes into compiling: -Os and -O2 were slower.
+            kind = ["-Oz"]
+            kind += [f"-D{name}={value}" for name, value in [*THIRD_PARTY, *WASM_SMALL]]
             kind += [] if source.suffix == ".c" else WASM_CPP_FLAGS
             clang = "clang-14" if source.suffix == ".c" else "clang++-14"
             self._run(clang, *WASM_FLAGS, *kind, f"-I{FORMATS}", "-c", source, "-o", result)
@@ -207,12 +207,18 @@ class BuildWasm(Command):
         names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
         exports = [f"-Wl,--export={name}" for name in names]
         self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
-        self._run("wasm-opt", "-Os", "--enable-simd", "--strip-producers", WASM, "-o", WASM)
+        self._run("wasm-opt", "-Oz", "--enable-simd", "--strip-producers", WASM, "-o", WASM)
+        arrays = (FORMATS / "prior_bytes.inc").read_text("utf-8")
+        priors = []
+        for name, numbers in re.findall(r"(\w+)\[\w*\] = \{([^}]*)\}", arrays):
+            priors.append(WASM.with_name(f"{name.lower()}.bin"))
+            priors[-1].write_bytes(bytes(int(number, 0) for number in re.findall(r"\w+", numbers)))
         read = sorted(
             {*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")}
         )
         digests = {
-            path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in [*read, WASM]
+            path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in [*read, *priors, WASM]
         }
         WASM.with_suffix(".wasm.json").write_text(json.dumps(digests, indent=1) + "\n", "utf-8")
 

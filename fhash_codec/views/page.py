@@ -17,7 +17,6 @@ import numpy as np
 
 from fhash_codec.boxes import Box
 from fhash_codec.rendering.colours import named_map
-from fhash_formats import transform
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, MissingDependencyError, MissingInputError, OutputError
 from fhash_formats.support.files import check_output, replacing_all
@@ -28,14 +27,15 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).with_name("page")
 """Files of the page, of which those in KINDS are given."""
 PRIORS = ("prior.bin", "mask_prior.bin", "fast_prior.bin")
-"""Files beside the format's Python modules that the decoder fetches when it needs them."""
+"""Files that the decoder fetches when it needs them: numbers 0 to 2 of native/priors.hpp."""
 KINDS = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".wasm": "application/wasm",
+    ".bin": "application/octet-stream",
 }
-"""Media types of the page's files by suffix; all others are application/octet-stream."""
+"""Media types of the page's files by suffix, and of containers: that of .bin."""
 INDEX = "index.html"
 PIECE = 1 << 20
 """Bytes that are read from a container at a time."""
@@ -47,8 +47,7 @@ THUMBNAIL = 160
 
 def _files() -> dict[str, Path]:
     """The page's files by name."""
-    files = {path.name: path for path in FOLDER.iterdir() if path.suffix in KINDS}
-    return files | {name: Path(transform.__file__).with_name(name) for name in PRIORS}
+    return {path.name: path for path in FOLDER.iterdir() if path.suffix in KINDS}
 
 
 def _index(names: Sequence[str]) -> bytes:
@@ -105,9 +104,7 @@ class Page:
 
     def kind(self, key: str) -> str:
         """The media type of a key."""
-        return KINDS.get(
-            Path(key or INDEX).suffix if key not in self.runs else "", "application/octet-stream"
-        )
+        return KINDS[".bin" if key in self.runs else Path(key or INDEX).suffix]
 
     def pieces(self, key: str, first: int, end: int) -> Iterator[bytes]:
         """Yield the bytes of a key that there is, from `first` to before `end`."""
@@ -172,7 +169,7 @@ def embedded() -> tuple[str, dict[str, Any]]:
     )
     sent = {
         "wasm": (FOLDER / "fhash.wasm").read_bytes(),
-        "priors": [_files()[name].read_bytes() for name in PRIORS],
+        "priors": [(FOLDER / name).read_bytes() for name in PRIORS],
         "script": (FOLDER / "worker.js").read_text("utf-8"),
     }
     return text, sent

@@ -36,7 +36,7 @@ from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import SCENE_KEY, Scene, scene_in_png, text_in_png
 from fhash_codec.views.page import FOLDER, PRIORS, WIDGET, Page, embedded
 from fhash_codec.views.server import Server
-from fhash_formats import native, transform
+from fhash_formats import native
 from fhash_formats.errors import InputError, MissingDependencyError, OutputExistsError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -287,8 +287,7 @@ def test_decoder_gives_the_bits_of_the_library() -> None:
     if not hasattr(library, "fhash_open_path"):
         pytest.skip("the library reads no files")
     runs = sorted(GOLDEN.glob("compact-*.fhz"))
-    priors = Path(transform.__file__).parent
-    words = ["node", Path(__file__).with_name("decode.mjs"), WASM, priors, *runs]
+    words = ["node", Path(__file__).with_name("decode.mjs"), WASM, FOLDER, *runs]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     found, compared = json.loads(done.stdout), 0
     for run in runs:
@@ -369,9 +368,7 @@ def test_server_gives_page_and_container_alone(whole: Path, tmp_path: Path) -> N
         assert ask(url, name)[2] == whole.read_bytes()
         assert ask(url, "fhash.wasm")[1]["Content-Type"] == "application/wasm"
         assert ask(url, "app.js")[1]["Content-Type"].startswith("text/javascript")
-        assert (
-            ask(url, "prior.bin")[2] == Path(transform.__file__).with_name("prior.bin").read_bytes()
-        )
+        assert ask(url, "prior.bin")[2] == (FOLDER / "prior.bin").read_bytes()
         for other in (
             "secret.txt",
             "../secret.txt",
