@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units hard every device wheels wasm view clean
+.PHONY: demo test types units hard every device lib paraview wheels wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
@@ -38,6 +38,16 @@ hard: .venv/.stamp
 # Every case of every other test, of which `make test` runs up to two of each.
 every: .venv/.stamp
 	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
+
+# libfhash, shared and static, its header, fhash.pc and CMake's files below build/lib (docs/c-library.md). Needs cmake.
+lib:
+	cmake -S formats/fhash_formats/native -B build/cmake -DCMAKE_INSTALL_PREFIX=$(CURDIR)/build/lib -DCMAKE_INSTALL_LIBDIR=lib
+	cmake --build build/cmake --parallel 2
+	cmake --install build/cmake
+
+# What pvpython shows of a container, and its picture in build/paraview. Needs paraview, python3-paraview and xvfb.
+paraview: .venv/.stamp
+	FHASH_PARAVIEW=$(CURDIR)/build/paraview $(BIN)/python -m pytest -rs tests/codec/views/test_vtk.py
 
 # Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/gpu.md): 7 minutes.
 device:

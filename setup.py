@@ -50,6 +50,13 @@ GNU_FLAGS = [
 GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if TARGET or sys.platform == "linux" else []
 """Debug records and symbol tables would make the libraries five times as large; on Windows they
 would lie beside them."""
+LIBFHASH_FLAGS = (
+    (f"-Wl,--version-script={FORMATS / 'exports.map'}", "-Wl,-soname,libfhash.so")
+    if "linux" in (TARGET or sys.platform)
+    else ()
+)
+"""The interface alone is exported, and nothing of the standard library; programs find the library
+by its name in the package. CMakeLists.txt builds it for a system, as libfhash.so.1."""
 NETWORK_FLAGS = ("-ffp-contract=fast", "-pthread")
 """Fused multiply-adds, and threads, for the network alone: no stream depends on its bits."""
 THIRD_PARTY: list[tuple[str, str | None]] = [
@@ -155,9 +162,9 @@ class BuildNative(build_ext):
     def _build_with_flags(self) -> None:
         for extension in self.extensions:
             msvc = self.compiler.compiler_type == "msvc"
-            own = extension.extra_compile_args
+            own, links = extension.extra_compile_args, extension.extra_link_args
             extension.extra_compile_args = MSVC_FLAGS if msvc else [*GNU_FLAGS, *own]
-            extension.extra_link_args = [] if msvc else GNU_LINK_FLAGS
+            extension.extra_link_args = [] if msvc else [*GNU_LINK_FLAGS, *links]
         super().build_extensions()
 
 
@@ -183,8 +190,8 @@ class BuildWasm(Command):
     def run(self) -> None:
         build = Path("build/wasm")
         build.mkdir(parents=True, exist_ok=True)
-        sources = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
-
+        every = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
+        sources = [source for source in every if source.name != "hdf5_filter.cpp"]
         headers = max(path.stat().st_mtime for path in [*FORMATS.rglob("*.h*"), Path(__file__)])
 
         def compiled(source: Path) -> Path:
@@ -214,7 +221,7 @@ class BuildWasm(Command):
             priors.append(WASM.with_name(f"{name.lower()}.bin"))
             priors[-1].write_bytes(bytes(int(number, 0) for number in re.findall(r"\w+", numbers)))
         read = sorted(
-            {*sources, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")}
+            {*every, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")}
         )
         digests = {
             path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -226,10 +233,13 @@ class BuildWasm(Command):
         subprocess.run([str(word) for word in words], check=True)
 
 
-def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension:
+def native(
+    name: str, folder: Path, *, flags: tuple[str, ...] = (), link_flags: tuple[str, ...] = ()
+) -> Extension:
     """The library of all C++ sources in a folder, and of the C sources in its `third_party`.
 
-    `flags` are added to those of every library, where the compiler is GCC or Clang.
+    `flags` and `link_flags` are added to those of every library, where the compiler is GCC or
+    Clang.
     """
     headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp"), *FORMATS.glob("*.h")}
     others = sorted((folder / "third_party").glob("**/*.c"))
@@ -240,13 +250,14 @@ def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension
         include_dirs=[FORMATS.as_posix()],
         define_macros=THIRD_PARTY if others else [],
         extra_compile_args=list(flags),
+        extra_link_args=list(link_flags),
         language="c++",
     )
 
 
 setup(
     ext_modules=[
-        native("fhash_formats.native._core", FORMATS),
+        native("fhash_formats.native.libfhash", FORMATS, link_flags=LIBFHASH_FLAGS),
         native("fhash_codec.native._codec", CODEC, flags=("-pthread",)),
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],

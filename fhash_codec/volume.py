@@ -29,7 +29,7 @@ from fhash_codec.times import Time, times_of
 from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.container.header import EVERYTHING, RESIDUAL
-from fhash_formats.errors import InputError, RegionError
+from fhash_formats.errors import InputError, MissingDependencyError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
 from fhash_formats.transform.values import about_origin
@@ -415,6 +415,41 @@ class Volume(Card, ArrayLike):
         without such a vertex.
         """
         return coarse_vertices(self.box, self._checked(region), lod, str(self.path))
+
+    def to_vtk(self, t: float, region: Spans | None = None, lod: int = 0) -> Any:
+        """Values at step `t` as points of a vtkImageData, or vtkRectilinearGrid on uneven axes.
+
+        t: a step; a fraction lies between two steps, with lod 0.
+        region: in vertices of the domain; the whole domain if None.
+        lod: level of detail, as `read_lod` takes it; it gives vertices of the feature bounding box.
+
+        Positions ascend; points without a value are NaN and hidden. Raises what `read` and
+        `read_lod` raise, and MissingDependencyError without VTK.
+        """
+        from fhash_codec.paraview_reader import ascending, vtk_grid
+
+        values = self.read_lod(t, lod, region) if lod else self.read(t, region)
+        whole = [range(*span) for span in self._checked(region)]
+        vertices = self.lod_vertices(lod, region) if lod else whole
+        axes = [
+            ascending(self.coords[axis].values[list(along)])
+            for axis, along in zip(AXES[1:], vertices, strict=True)
+        ]
+        turned = values[tuple(slice(None, None, turn) for _, turn in axes)]
+        try:
+            return vtk_grid(
+                [(self.name, self.units, turned)], [positions for positions, _ in axes], (0, 0, 0)
+            )
+        except ImportError as error:
+            raise MissingDependencyError("to_vtk needs VTK: pip install vtk") from error
+
+    def to_pyvista(self, t: float, region: Spans | None = None, lod: int = 0) -> Any:
+        """The grid of `to_vtk` as PyVista's; MissingDependencyError without PyVista."""
+        try:
+            from pyvista import wrap
+        except ImportError as error:
+            raise MissingDependencyError("to_pyvista needs pip install pyvista") from error
+        return wrap(self.to_vtk(t, region, lod))
 
     def sample(
         self,

@@ -23,7 +23,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("support",),
         ("native", "series"),
         ("transform",),
-        ("container",),
+        ("container", "hdf5"),
         ("readers",),
         ("writers",),
     ),
@@ -46,7 +46,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("growing",),
     ),
     "fhash_codec": (
-        ("native", "progress", "records"),
+        ("native", "paraview_reader", "progress", "records"),
         ("boxes", "config", "devices", "measure"),
         ("features",),
         ("header",),

@@ -35,6 +35,8 @@ COMMANDS = {
     "info": "say what RUN.fhz holds and how good it is",
     "serve": "give decoded values of RUN.fhz over HTTP, as Zarr, to any client",
     "export": "write the model of RUN.fhz in plain numbers, for any Zarr library",
+    "hdf5-plugin-path": "print the folder of the filter for HDF5, for HDF5_PLUGIN_PATH",
+    "paraview": "open RUN.fhz in ParaView, or print the path of its reader",
     "verify": "read and check every part of RUN.fhz",
     "diff": "measure RUN.fhz against the data it was made from",
     "demo": "simulate, encode, decode, compare, draw",
@@ -51,6 +53,7 @@ FILES = {
     **dict.fromkeys(("plan", "merge", "append"), "parts"),
     **dict.fromkeys(("pack", "unpack", "export", "serve"), "zarr"),
     **dict.fromkeys(("verify", "diff"), "checks"),
+    **dict.fromkeys(("hdf5-plugin-path", "paraview"), "plugins"),
 }
 """Modules of the commands that share one; any other command has one of its own name."""
 
@@ -72,14 +75,13 @@ class Program(click.Group):
         if name in DISTRIBUTIONS:
             return _of_distribution(name)
         module = importlib.import_module(f"fhash_cli.commands.{FILES.get(name, name)}")
-        return cast(
-            click.Command, getattr(module, f"{name}_command" if name in FILES else "command")
-        )
+        attribute = f"{name.replace('-', '_')}_command" if name in FILES else "command"
+        return cast(click.Command, getattr(module, attribute))
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands for `--help`, without importing them."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl(list(COMMANDS.items()), col_max=10)  # one name is longer
 
     def invoke(self, context: click.Context) -> Any:
         """Run the command; each warning is one line on stderr.

@@ -30,7 +30,7 @@ from fhash_codec.selftest.case import Finding
 from fhash_codec.selftest.run import CaseResult, Summary
 from fhash_codec.views.server import Server
 
-WITHOUT_JSON = {"completion"}
+WITHOUT_JSON = {"completion", "hdf5-plugin-path", "paraview"}
 """Commands whose output is no result."""
 
 

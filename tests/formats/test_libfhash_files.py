@@ -7,18 +7,22 @@ import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, Volume
+from fhash_codec import EncodeConfig, Volume, encoding
+from fhash_codec.compact import encode as compact
 from fhash_formats import native
 from fhash_formats.container import Container
 from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.head import Layer, NeighbourHead
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 NAMES = sorted(path.stem for path in GOLDEN.glob("*.fhz"))
@@ -278,6 +282,48 @@ def test_few_reads_and_few_bytes_and_no_tile_twice(tiled: Path) -> None:
         file.reads.clear()
         file.read(0, SPACE)
         assert len(file.reads) <= 2  # all tiles of the layer lie together
+
+
+def random_head() -> NeighbourHead:
+    chance = np.random.default_rng(3)
+    layers = tuple(
+        Layer(
+            weights=chance.integers(-20, 21, shape).astype(np.int8),
+            biases=chance.integers(-99, 100, shape[0]).astype(np.int8),
+            weight_scale=0.0123291015625,
+            bias_scale=0.0078125,
+        )
+        for shape in [(4, 28), (3, 36), (1, 3)]
+    )
+    return NeighbourHead(layers=layers, sigma=0.125, low=-4.0, high=4.0, cross=True)
+
+
+def test_a_region_of_a_tile_with_a_head_equals_that_part_of_the_tile(tmp_path: Path) -> None:
+    code, path = compact.code_series, tmp_path / "head.fhz"
+
+    def coded(*arguments: Any, **options: Any) -> Any:
+        table = code(*arguments, **options)
+        settings = replace(table.plan.settings, head=random_head())
+        return replace(table, plan=replace(table.plan, settings=settings))
+
+    values = np.random.default_rng(8).normal(size=(2, *SPACE)).astype(np.float32)
+    config = EncodeConfig(psnr=50.0, effort=2, tile="2x16x32x16", timings=False)
+    with (
+        mock.patch.object(compact, "code_series", coded),
+        mock.patch.object(encoding, "missed_promise", return_value=None),
+    ):
+        fhash_codec.encode(values, path, config)
+    with fhash_codec.open(path) as volume:
+        assert volume.container.arrays["tables/level_1"].settings.head is not None
+        wanted = [volume.read(step) for step in range(2)]
+    places = [(0, 0, 0), (5, 9, 8), (13, 29, 29), (7, 15, 14)]
+    for place in places:
+        part = [(first, first + 3) for first in place]
+        slices = tuple(slice(*span) for span in part)
+        with Opened(path, threads=2) as file:
+            for step in (0, 1, 0):  # before the tile is whole, and once it is
+                assert_same(file.read(step, part), wanted[step][slices], None)
+            assert_same(file.read(1, SPACE), wanted[1], None)
 
 
 def test_threads_read_one_file_at_once(tiled: Path) -> None:

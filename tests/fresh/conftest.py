@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = (
-    "formats/fhash_formats/native/_core.so",
+    "formats/fhash_formats/native/libfhash.so",
     "fhash_codec/native/_codec.so",
     "fhash_codec/native/network/_network.so",
 )

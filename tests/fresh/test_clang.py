@@ -31,7 +31,7 @@ RUN = """
 import os, pathlib, pytest, sys
 import numpy as np
 import fhash_codec, fhash_formats.native as native
-native._FOLDER = pathlib.Path(sys.argv[1])
+native.FOLDER = pathlib.Path(sys.argv[1])
 code = 0
 for tests, long, names in (
     ("golden/test_golden.py", "1", "their_values or same_bits"),
@@ -41,7 +41,7 @@ for tests, long, names in (
     code = code or pytest.main(["-p", "no:xdist", "-k", names, tests])
 config = fhash_codec.EncodeConfig(max_error_rel=1e-3, timings=False)
 fhash_codec.encode(np.load(sys.argv[2]), sys.argv[3], config)
-print(*(folder for folder, name, _ in native._LOADED if name == "_core"))
+print(*(folder for folder, name, _ in native._LOADED if name == "libfhash"))
 sys.exit(code)
 """
 """Runs tests and an encoding with the library in a folder, then prints whence it was loaded.
@@ -76,7 +76,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_goldens_random_tiles_and_a_file_have_the_same_bits(folder: Path, tmp_path: Path) -> None:
-    assert b"clang version" in (folder / "_core.so").read_bytes()
+    assert b"clang version" in (folder / "libfhash.so").read_bytes()
     values = np.random.default_rng(0).normal(size=(3, 9, 14, 21)).astype(np.float32).cumsum(axis=3)
     np.save(tmp_path / "run.npy", values)
     config = fhash_codec.EncodeConfig(max_error_rel=1e-3, timings=False)

@@ -15,7 +15,7 @@ import pytest
 from fresh_install import fhash, run
 
 LIBRARIES = (
-    "fhash_formats/native/_core.so",
+    "fhash_formats/native/libfhash.so",
     "fhash_codec/native/_codec.so",
     "fhash_codec/native/network/_network.so",
 )
@@ -83,6 +83,8 @@ def test_the_source_archive_holds_what_builds_it(wheel: Path, tmp_path: Path) ->
     with tarfile.open(archive) as opened:
         names = {name.partition("/")[2] for name in opened.getnames()}
     assert {"build_backend.py", "setup.py", "pyproject.toml"} <= names
+    native = "formats/fhash_formats/native"
+    assert {f"{native}/CMakeLists.txt", f"{native}/exports.map"} <= names
 
 
 def test_the_wheel_holds_the_stripped_libraries(wheel: Path) -> None:
@@ -93,6 +95,9 @@ def test_the_wheel_holds_the_stripped_libraries(wheel: Path) -> None:
             assert name in names
             assert b".debug_info" not in archive.read(name)
     assert "fhash_formats/FORMAT.md" in names
+    linked = ("fhash.h", "fhash.pc", "fhash-config.cmake", "fhash-config-version.cmake")
+    assert {f"fhash_formats/native/{name}" for name in linked} <= set(names)
+    assert "fhash_codec/views/napari.yaml" in names
     assert not [name for name in names if name.startswith(("tests/", "build/"))]
 
 

@@ -148,7 +148,7 @@ def seen_by(python: Path, folder: Path, path: str, everything: bool) -> str:
     """Return the test that sees a fault in a file, or an empty text."""
     file = folder / path
     if file.suffix in (".cpp", ".hpp"):
-        library = "_core" if path.startswith(NATIVE) else "_codec"
+        library = "libfhash" if path.startswith(NATIVE) else "_codec"
         words = ["-c", BUILD, "-q", "build_ext", "--inplace", "--force", library]
         built = run(python, folder, words)
         if built.returncode:

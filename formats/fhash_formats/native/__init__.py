@@ -24,6 +24,7 @@ __all__ = [
     "ABI_VERSION",
     "ARRAY",
     "FLOAT",
+    "FOLDER",
     "INTEGER",
     "PROTOTYPES",
     "REAL",
@@ -157,14 +158,15 @@ PROTOTYPES: Prototypes = {
 """Functions of this package's library that Python calls."""
 
 _ADVICE = "install the package again (pip install .)"
-_FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parent
+"""Folder of libfhash with its header and build files; also that of HDF5's plugin, libfhash."""
 _LOCK = ForkLock()
 _LOADED: dict[tuple[Path, str, int], ctypes.CDLL] = {}
 
 
 def library() -> ctypes.CDLL:
     """The native library of this package; see `load_library`."""
-    return load_library(_FOLDER, "_core", ABI_VERSION, PROTOTYPES)
+    return load_library(FOLDER, "libfhash", ABI_VERSION, PROTOTYPES)
 
 
 def crc32c(data: bytes | memoryview) -> int:

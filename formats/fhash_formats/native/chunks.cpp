@@ -9,6 +9,14 @@
 FHASH_EXPORT std::int64_t fhash_crc32c(const void* in, std::int64_t n, std::int64_t crc,
                                        std::int64_t plain);
 
+// Of part.cpp: a tile before its head, and a part of it with its head.
+FHASH_EXPORT int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
+                                            const void* stream, size_t size, const int64_t* part,
+                                            float* values, int32_t* done, fhash_error* error);
+FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
+                                     const float* table, const int64_t* part, void* values,
+                                     fhash_error* error);
+
 namespace fhash {
 
 namespace {
@@ -20,6 +28,7 @@ constexpr uint64_t MOST = 8 << 20;         // bytes of a read of several chunks
 constexpr uint64_t SMALL_INDEX = 64 << 10; // bytes up to which all of an index is read
 constexpr uint64_t SHARE = 4;              // as is one of which that share is needed
 constexpr uint64_t INDEX = 1000;           // in the place of a level of detail, in the cache
+constexpr uint64_t UNCORRECTED = 1001;     // likewise: tiles before their head
 
 // An inner chunk that is to be read.
 struct Wanted {
@@ -86,12 +95,38 @@ void reorder(const Array& array, const int64_t tile[4], int thinned, Chunk& chun
     bytes = std::move(ordered);
 }
 
-bool decode_tile(fhash_context& context, const Array& array, const uint8_t* data, size_t size,
-                 int lod, Chunk& chunk, fhash_error& error) {
+fhash_tile tile_of(const Array& array) {
     fhash_tile tile = {{1, 1, 1, 1}, array.type, 0, nullptr, array.settings.size()};
     if (!array.settings.empty()) tile.settings = array.settings.data();
     for (int a = 0; a < array.axes; a++)
         if (array.places[a] >= 0) tile.shape[array.places[a]] = array.inner[a];
+    return tile;
+}
+
+// Whether a part of a tile may be had sooner than all of it: the head need not see the rest.
+bool is_parted(const Array& array) {
+    const bool headed = array.tiles && !array.settings.empty() && (uint8_t(array.settings[0]) & 32);
+    return headed && !array.masked() && array.usual && array.axes == 4;
+}
+
+// A part of a tile, first and last positions along t, z, y, x, out of the tile before its head.
+bool correct_part(fhash_context& context, const Array& array, const Chunk& table,
+                  const int64_t part[8], Chunk& chunk, fhash_error& error) {
+    const fhash_tile tile = tile_of(array);
+    size_t count = 1;
+    for (size_t a = 0; a < 4; a++) {
+        chunk.first[a] = part[2 * a];
+        chunk.shape[a] = part[2 * a + 1] - part[2 * a];
+        count *= size_t(chunk.shape[a]);
+    }
+    chunk.values.resize(count * fhash_type_size(array.type));
+    return fhash_tile_part(&context, &tile, reinterpret_cast<const float*>(table.values.data()),
+                           part, chunk.values.data(), &error) == FHASH_OK;
+}
+
+bool decode_tile(fhash_context& context, const Array& array, const uint8_t* data, size_t size,
+                 int lod, Chunk& chunk, fhash_error& error) {
+    const fhash_tile tile = tile_of(array);
     const bool own = array.places[0] == 0 || array.usual;  // whether levels are those of the tile
     const int level = own ? lod : 0;
     int64_t shape[4] = {tile.shape[0]};
@@ -254,19 +289,57 @@ struct Indices {
     }
 };
 
+// A chunk for the caller, and the tile before its head where that is to be kept instead of it.
+struct Decoded {
+    std::shared_ptr<Chunk> chunk, table;
+};
+
 // Reads and decodes chunks, those that lie together with one read, several at once in threads.
 struct Reading {
     fhash_file& file;
     const Array& array;
+    const Region& region;
     int lod;
     const Visit& visit;
 
-    bool decode(const Wanted& wanted, const uint8_t* data, Chunk& chunk, fhash_error& error) {
+    // A tile before its head, and the part of it that the region asks for; `done` says whether
+    // there is such a thing.
+    bool decode_part(const Wanted& wanted, const uint8_t* data, size_t size, Chunk& table,
+                     Chunk& chunk, bool& done, fhash_error& error) {
+        const fhash_tile tile = tile_of(array);
+        int64_t part[8];
+        for (size_t a = 0; a < 4; a++) {
+            const int64_t start = wanted.place[a] * array.inner[a];
+            part[2 * a] = std::max(region.first[a] - start, int64_t(0));
+            part[2 * a + 1] = std::min(region.last[a] - start, array.inner[a]);
+        }
+        int32_t apart = 0;
+        table.shape = array.inner;
+        if (!may_use(*file.context, 8 * array.inner_values(), error)) return false;
+        table.values.resize(size_t(4 * array.inner_values()));
+        if (fhash_tile_uncorrected(file.context, &tile, data, size, part,
+                                   reinterpret_cast<float*>(table.values.data()), &apart,
+                                   &error) != FHASH_OK)
+            return false;
+        done = apart != 0;
+        return !done || correct_part(*file.context, array, table, part, chunk, error);
+    }
+
+    bool decode(const Wanted& wanted, const uint8_t* data, Decoded& decoded, fhash_error& error) {
         const Member& member = *wanted.member;
         if (!array.sharded && !check_member(member, data, error)) return false;
-        if (decode_chunk(*file.context, array, data + wanted.skip,
-                         size_t(wanted.length - wanted.skip), lod, chunk, error))
-            return true;
+        const uint8_t* const stream = data + wanted.skip;
+        const size_t size = size_t(wanted.length - wanted.skip);
+        bool done = false, good = true;
+        decoded.chunk = std::make_shared<Chunk>();
+        if (!lod && is_parted(array)) {
+            decoded.table = std::make_shared<Chunk>();
+            good = decode_part(wanted, stream, size, *decoded.table, *decoded.chunk, done, error);
+        }
+        if (!done) decoded.table = nullptr;
+        if (good && !done)
+            good = decode_chunk(*file.context, array, stream, size, lod, *decoded.chunk, error);
+        if (good) return true;
         std::string name = "member " + member.name;
         if (array.sharded) name += ": inner chunk " + std::to_string(wanted.in_shard);
         return fail_in(error, name);
@@ -282,14 +355,13 @@ struct Reading {
                                                       1, file.context->memory / 32 / each));
         for (size_t first = 0; first < count; first += threads) {
             const size_t now = std::min(threads, count - first);
-            std::vector<std::shared_ptr<Chunk>> chunks(now);
+            std::vector<Decoded> chunks(now);
             std::vector<fhash_error> errors(now);
             std::vector<uint8_t> done(now, 0);
-            for (size_t i = 0; i < now; i++) chunks[i] = std::make_shared<Chunk>();
             const auto work = [&](int i) {
                 const Wanted& one = wanted[first + size_t(i)];
                 done[size_t(i)] = decode(one, bytes.data() + (one.offset - start),
-                                         *chunks[size_t(i)], errors[size_t(i)]);
+                                         chunks[size_t(i)], errors[size_t(i)]);
             };
             if (now == 1) work(0);
             else together(int(now), work);
@@ -299,8 +371,10 @@ struct Reading {
                     return false;
                 }
                 const Wanted& one = wanted[first + i];
-                file.cache.put({array.number, one.number, uint64_t(lod)}, chunks[i]);
-                if (!visit(one.place, *chunks[i])) return false;
+                const bool apart = chunks[i].table != nullptr;
+                file.cache.put({array.number, one.number, apart ? UNCORRECTED : uint64_t(lod)},
+                               apart ? chunks[i].table : chunks[i].chunk);
+                if (!visit(one.place, *chunks[i].chunk)) return false;
             }
         }
         return true;
@@ -355,6 +429,22 @@ void Cache::put(const Key& key, const ChunkPointer& chunk) {
     }
 }
 
+// All of a tile that is kept before its head, which is then kept as well; null for none.
+static bool find_whole(fhash_file& file, const Array& array, const Cache::Key& key,
+                       ChunkPointer& found, fhash_error& error) {
+    const ChunkPointer table = file.cache.get({key[0], key[1], UNCORRECTED});
+    if (!table) return true;
+    const std::shared_ptr<Chunk> whole = std::make_shared<Chunk>();
+    int64_t part[8] = {};
+    for (size_t a = 0; a < 4; a++) part[2 * a + 1] = array.inner[a];
+    if (!may_use(*file.context, 16 * array.inner_values(), error) ||
+        !correct_part(*file.context, array, *table, part, *whole, error))
+        return false;
+    file.cache.put(key, whole);
+    found = whole;
+    return true;
+}
+
 bool visit_chunks(fhash_file& file, const Array& array, const Region& region, int lod,
                   const Visit& visit, fhash_error& error) {
     Lengths first = {}, last = {}, place = {};
@@ -380,15 +470,17 @@ bool visit_chunks(fhash_file& file, const Array& array, const Region& region, in
             number = number * uint64_t(array.count(array.inner, a)) + uint64_t(place[a]);
             needed = needed && touched(a);
         }
-        const ChunkPointer kept =
-            needed ? file.cache.get({array.number, number, uint64_t(lod)}) : nullptr;
+        const Cache::Key key = {array.number, number, uint64_t(lod)};
+        ChunkPointer kept = needed ? file.cache.get(key) : nullptr;
+        const bool apart = needed && !kept && !lod && is_parted(array);
+        if (apart && !find_whole(file, array, key, kept, error)) return false;
         if (needed && !kept) wanted.push_back({place, number, nullptr, 0, 0, 0, 0});
         if (kept && !visit(place, *kept)) return false;
         for (int a = array.axes - 1; a >= 0 && ++place[a] == last[a]; a--) place[a] = first[a];
     }
     if (wanted.empty()) return true;
     Indices indices{file, array};
-    Reading reading{file, array, lod, visit};
+    Reading reading{file, array, region, lod, visit};
     return indices.locate_all(wanted, error) && reading.read(wanted, error);
 }
 
@@ -410,7 +502,7 @@ bool read_region(fhash_file& file, const Array& array, const Region& region, Buf
             const int64_t start = place[a] * array.inner[a];
             const int64_t low = std::max(start, region.first[a]);
             counts[a] = std::min(start + array.inner[a], region.last[a]) - low;
-            from += uint64_t((low - start) * own[a]);
+            from += uint64_t((low - start - chunk.first[a]) * own[a]);
             to += uint64_t((low - region.first[a]) * strides[a]);
         }
         copy_region(chunk.values.data() + from * item, own, values.data() + to * item, strides,

@@ -9,9 +9,9 @@
 
 namespace fhash {
 
-// A decoded inner chunk, in the order of the array's axes.
+// A decoded inner chunk, in the order of the array's axes; or only a part of it, from `first` on.
 struct Chunk {
-    Lengths shape = {};
+    Lengths shape = {}, first = {};
     Buffer values;
     Buffer mask;  // a byte for each value, of tiles that have a mask; else empty
 

@@ -30,6 +30,10 @@ bool check_keys(Json object, fhash_error& error) {
     return true;
 }
 
+JsonDocument kept(yyjson_doc* document) {
+    return JsonDocument(document, [](yyjson_doc* each) { yyjson_doc_free(each); });
+}
+
 // Refuses what is nested too deep (yyjson does not recurse, and has no limit), and keys twice.
 bool check_value(Json value, int depth, fhash_error& error) {
     if (!yyjson_is_ctn(value)) return true;
@@ -64,7 +68,7 @@ bool parse_json(const uint8_t* data, size_t size, const fhash_context& context, 
     if (!may_use(context, yyjson_read_max_memory_usage(size, 0), error)) return false;
     yyjson_read_err why = {};
     char* text = reinterpret_cast<char*>(const_cast<uint8_t*>(data));  // which stays as it is
-    found.reset(yyjson_read_opts(text, size, 0, nullptr, &why), yyjson_doc_free);
+    found = kept(yyjson_read_opts(text, size, 0, nullptr, &why));
     if (!found && why.code == YYJSON_READ_ERROR_MEMORY_ALLOCATION)
         return fail(error, FHASH_ERROR_MEMORY, "no memory for JSON of %zu bytes", size);
     if (!found)
@@ -86,7 +90,7 @@ bool json_text(Json value, std::string& text) {
 }
 
 bool json_is(Json value, const char* text) {
-    JsonDocument other(yyjson_read(text, std::strlen(text), 0), yyjson_doc_free);
+    const JsonDocument other = kept(yyjson_read(text, std::strlen(text), 0));
     return value && other && yyjson_equals(value, yyjson_doc_get_root(other.get()));
 }
 

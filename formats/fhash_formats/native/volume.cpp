@@ -122,11 +122,13 @@ struct Along {
         end = start + length <= lattice.first[axis] ? 0 : number(start + length);
     }
     // The vertex of the chunk that is nearest to one of the lattice, where the chunk has every
-    // 2^lod-th of `size`.
-    int64_t nearest(const Lattice& lattice, int axis, int64_t number, int lod, int64_t size) const {
+    // 2^lod-th.
+    int64_t nearest(const Lattice& lattice, int axis, int64_t number, int lod,
+                    const Chunk& chunk) const {
+        const size_t a = size_t(axis) + 1;
         const int64_t step = int64_t(1) << lod;
         const int64_t vertex = lattice.first[axis] + (number << lattice.lod) - start;
-        return std::min((vertex + step / 2) / step, size - 1);
+        return std::min((vertex + step / 2) / step - chunk.first[a], chunk.shape[a] - 1);
     }
 };
 
@@ -138,14 +140,12 @@ void take_chunk(const Array& table, int64_t key, const Lattice& lattice, int lod
         x(lattice, 2, place[3], table.inner[3]);
     std::vector<int64_t> columns;
     for (int64_t i = x.begin; i < x.end; i++)
-        columns.push_back(x.nearest(lattice, 2, i, lod, chunk.shape[3]));
-    const int64_t t = key % table.inner[0];
+        columns.push_back(x.nearest(lattice, 2, i, lod, chunk));
+    const int64_t t = key % table.inner[0] - chunk.first[0];
     for (int64_t k = z.begin; k < z.end; k++)
         for (int64_t j = y.begin; j < y.end; j++) {
-            const int64_t row = (t * chunk.shape[1] +
-                                 z.nearest(lattice, 0, k, lod, chunk.shape[1])) *
-                                    chunk.shape[2] +
-                                y.nearest(lattice, 1, j, lod, chunk.shape[2]);
+            const int64_t plane = t * chunk.shape[1] + z.nearest(lattice, 0, k, lod, chunk);
+            const int64_t row = plane * chunk.shape[2] + y.nearest(lattice, 1, j, lod, chunk);
             const int64_t to = (k * lattice.count[1] + j) * lattice.count[2] + x.begin;
             take(size_t(to), size_t(row * chunk.shape[3]), columns);
         }

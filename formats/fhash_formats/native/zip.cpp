@@ -18,7 +18,7 @@ constexpr uint64_t MAX_DOCUMENT = 16 << 20;      // bytes of an inflated member
 constexpr size_t MAX_NAME = 512;
 constexpr size_t COMMENT = 79;                   // bytes of the comment of this format
 constexpr uint64_t MAX_16 = 0xFFFF, MAX_32 = 0xFFFFFFFF;
-constexpr size_t LOCAL = 30, ENTRY = 46, END = 22, END_64 = 56, LOCATOR_64 = 20;
+constexpr size_t ENTRY = 46, END = 22, END_64 = 56, LOCATOR_64 = 20;
 
 void put(Buffer& bytes, uint64_t value, int count) {
     for (int i = 0; i < count; i++) bytes.push_back(uint8_t(value >> 8 * i));

@@ -1,4 +1,4 @@
-"""`fhash verify` and `fhash diff`."""
+"""`fhash verify`, `diff`, `hdf5-plugin-path` and `paraview`."""
 
 from __future__ import annotations
 
@@ -404,3 +404,32 @@ def test_the_report_is_written_once(
 )
 def test_what_cannot_be_is_refused(refused: Refused, words: tuple[str, ...], message: str) -> None:
     assert message in refused(2, "selftest", *words)
+
+
+def test_the_folder_of_the_plugin_of_hdf5_is_printed(fhash: Fhash) -> None:
+    assert Path(fhash("hdf5-plugin-path").stdout.strip(), "libfhash.so").is_file()
+
+
+PARAVIEW = """#!/bin/sh
+cat "$PV_PLUGIN_CONFIG_FILE"
+test -f "${PYTHONPATH%%:*}/sitecustomize.py" && echo "opened $@"
+exit 3
+"""
+
+
+def test_paraview_is_started_with_its_reader(
+    fhash: Fhash, refused: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, library = fhash("paraview").stdout.splitlines()
+    assert Path(reader).is_file()
+    assert Path(library.removeprefix("FHASH_LIBRARY=")).is_file()
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    (tmp_path / "paraview").write_text(PARAVIEW)
+    (tmp_path / "paraview").chmod(0o755)
+    words = [sys.executable, "-m", "fhash_cli.main", "paraview", "a.fhz", "b.fhz"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 3
+    assert f'filename="{reader}"' in done.stdout
+    assert "opened a.fhz b.fhz" in done.stdout
+    monkeypatch.setenv("PATH", "")
+    assert "no program paraview" in refused(2, "paraview", "a.fhz")

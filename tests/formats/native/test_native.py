@@ -18,26 +18,26 @@ SOURCES = Path(native.__file__).parent
 @pytest.fixture
 def built_copy(tmp_path: Path) -> Path:
     """A folder with a copy of the native library."""
-    shutil.copy(SOURCES / "_core.so", tmp_path)
+    shutil.copy(SOURCES / "libfhash.so", tmp_path)
     return tmp_path
 
 
 def test_a_folder_without_a_build_is_a_plain_error(tmp_path: Path) -> None:
     with pytest.raises(MissingDependencyError, match="there is no native library"):
-        load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES)
+        load_library(tmp_path, "libfhash", ABI_VERSION, PROTOTYPES)
 
 
 def test_a_damaged_library_is_a_plain_error(tmp_path: Path) -> None:
-    (tmp_path / "_core.so").write_bytes(b"not a library")
+    (tmp_path / "libfhash.so").write_bytes(b"not a library")
     with pytest.raises(MissingDependencyError, match="install the package again"):
-        load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES)
+        load_library(tmp_path, "libfhash", ABI_VERSION, PROTOTYPES)
 
 
 def test_a_library_of_other_sources_is_a_plain_error(built_copy: Path) -> None:
-    assert load_library(built_copy, "_core", ABI_VERSION, PROTOTYPES) is not None
+    assert load_library(built_copy, "libfhash", ABI_VERSION, PROTOTYPES) is not None
     message = f"has ABI {ABI_VERSION}, this version of the package needs {ABI_VERSION + 1}"
     with pytest.raises(MissingDependencyError, match=message):
-        load_library(built_copy, "_core", ABI_VERSION + 1, PROTOTYPES)
+        load_library(built_copy, "libfhash", ABI_VERSION + 1, PROTOTYPES)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_a_library_that_lacks_a_function_is_a_plain_error(
     built_copy: Path, prototypes: native.Prototypes, version_symbol: str
 ) -> None:
     with pytest.raises(MissingDependencyError, match=r"cannot be used .*fhash_nothing"):
-        load_library(built_copy, "_core", ABI_VERSION, prototypes, version_symbol=version_symbol)
+        load_library(built_copy, "libfhash", ABI_VERSION, prototypes, version_symbol=version_symbol)
 
 
 def test_the_sources_and_the_loader_agree_on_the_abi() -> None:

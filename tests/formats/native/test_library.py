@@ -1,0 +1,140 @@
+"""libfhash for other languages: what it exports, its build files, and the examples of docs."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_formats.native import FOLDER, PROTOTYPES
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLES = ROOT / "docs" / "examples"
+HEADER = (FOLDER / "fhash.h").read_text(encoding="utf-8")
+LINKED = [f"-I{FOLDER}", f"-L{FOLDER}", "-lfhash", f"-Wl,-rpath,{FOLDER}"]
+
+
+def run(*words: object, folder: Path | None = None) -> str:
+    """Output of a program; the test skips where it is not installed."""
+    if shutil.which(str(words[0])) is None:
+        pytest.skip(f"{words[0]} is not installed")
+    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="nm reads ELF")
+def test_the_library_exports_its_interface_and_what_python_calls_alone() -> None:
+    shown = run("nm", "-D", "--defined-only", FOLDER / "libfhash.so")
+    exported = {line.split()[-1] for line in shown.splitlines()}
+    public = set(re.findall(r"^FHASH_API .*?(fhash_\w+)\(", HEADER, re.MULTILINE))
+    plugin = {"H5PLget_plugin_info", "H5PLget_plugin_type"}
+    assert exported == public | PROTOTYPES.keys() | plugin | {"fhash_abi_version"}
+    assert len(public) >= 15
+
+
+def test_build_files_agree_on_version_and_flags() -> None:
+    numbers = re.findall(r"#define FHASH_VERSION_M\w+ (\d+)", HEADER)
+    version = ".".join(numbers)
+    assert f"\nVersion: {version}\n" in (FOLDER / "fhash.pc").read_text()
+    told = (FOLDER / "fhash-config-version.cmake").read_text()
+    assert f"set(PACKAGE_VERSION {version})" in told
+    assert f"MAJOR EQUAL {numbers[0]} " in told
+    setup = ast.parse((ROOT / "setup.py").read_text(encoding="utf-8"))
+    cmake = (FOLDER / "CMakeLists.txt").read_text(encoding="utf-8")
+    (flags,) = (
+        ast.literal_eval(node.value)
+        for node in setup.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "GNU_FLAGS"
+    )
+    assert not [flag for flag in flags if flag.startswith(("-f", "-O")) and flag not in cmake]
+
+
+@pytest.fixture(scope="module")
+def container(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A container with missing values."""
+    t, z, y, x = np.meshgrid(*map(np.arange, (4, 9, 12, 14)), indexing="ij", sparse=True)
+    values = np.sin(0.3 * x + 0.2 * y * t) + 0.1 * z
+    values[:, 2, 3:6, 4:9] = np.nan
+    path = tmp_path_factory.mktemp("library") / "run.fhz"
+    config = fhash_codec.EncodeConfig(effort=1, max_error=0.01)
+    fhash_codec.encode(values.astype("f4"), path, config)
+    return path
+
+
+def check(shown: str, path: Path) -> None:
+    """Compare what an example prints with Python's values."""
+    with fhash_codec.open(path) as volume:
+        region = volume.read(1.5, ((0, 5), (0, 6), (0, 7)))
+        assert f"{volume.name} (4, 9, 12, 14) {volume.units}" in shown
+    found = re.search(r"last +(\S+) mean +(\S+) of +(\d+)", shown)
+    assert found is not None, shown
+    known = region[np.isfinite(region)].astype("f8")
+    assert float(found[1]) == pytest.approx(float(region[-1, -1, -1]), rel=1e-8)
+    assert float(found[2]) == pytest.approx(known.mean(), rel=1e-10)
+    assert int(found[3]) == known.size < region.size
+
+
+@pytest.mark.parametrize(
+    ("compiler", "source"),
+    [
+        ("gcc -std=c99 -Wall -Wextra -pedantic -Werror", "read_region.c"),
+        ("g++ -std=c++17 -Wall -Wextra -pedantic -Werror", "read_region.cpp"),
+        ("gfortran -std=f2018 -ffree-line-length-none -Wall -Werror", "read_region.f90"),
+    ],
+)
+def test_an_example_reads_a_region(
+    compiler: str, source: str, container: Path, tmp_path: Path
+) -> None:
+    words = [*compiler.split(), EXAMPLES / source, *LINKED, "-lm", "-o", tmp_path / "program"]
+    run(*words, folder=tmp_path)
+    check(run(tmp_path / "program", container), container)
+    failed = subprocess.run([tmp_path / "program", "no.fhz"], capture_output=True, text=True)
+    assert failed.returncode == 1
+    assert "cannot be opened" in failed.stdout + failed.stderr
+
+
+def test_the_example_of_octave_reads_a_region(container: Path, tmp_path: Path) -> None:
+    run("mkoctfile", "--mex", EXAMPLES / "fhash_read.c", *LINKED, folder=tmp_path)
+    words = ["octave-cli", "--norc", "-q", "--path", EXAMPLES, "--path", tmp_path, "--eval"]
+    check(run(*words, f'read_region("{container}")'), container)
+    line = 'try, fhash_read("no.fhz", 0, 0, []), catch e, disp(["refused " e.message]), end'
+    assert "refused fhash_read: the file cannot be opened" in run(*words, line)
+
+
+@pytest.mark.parametrize("place", ["package", "make lib"])
+def test_pkg_config_and_cmake_find_the_library(place: str, container: Path, tmp_path: Path) -> None:
+    system = ROOT / "build" / "lib" / "lib"
+    if place == "make lib" and not system.is_dir():
+        pytest.skip("`make lib` was not run")
+    package, library, config = (
+        (FOLDER, FOLDER, FOLDER)
+        if place == "package"
+        else (system / "pkgconfig", system, system / "cmake" / "fhash")
+    )
+    words = ["pkg-config", f"--with-path={package}", "--cflags", "--libs"]
+    flags = [Path(flag[2:]).resolve() for flag in run(*words, "fhash").split() if "/" in flag]
+    assert flags[1:] == [library]
+    assert (flags[0] / "fhash.h").is_file()
+    (tmp_path / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(example C)\nfind_package(fhash 1.0 REQUIRED)"
+        f"\nadd_executable(example {EXAMPLES / 'read_region.c'})"
+        "\ntarget_link_libraries(example fhash::fhash m)"
+    )
+    run("cmake", f"-Dfhash_DIR={config}", "-S", tmp_path, "-B", tmp_path / "build")
+    run("cmake", "--build", tmp_path / "build")
+    check(run(tmp_path / "build" / "example", container), container)
+    if place == "make lib":
+        static = run(*words, "--static", "fhash").replace("-lfhash", f"{library / 'libfhash.a'}")
+        source = EXAMPLES / "read_region.c"
+        run("gcc", source, *static.split(), "-lm", "-o", tmp_path / "static")
+        assert "fhash" not in run("ldd", tmp_path / "static")
+        check(run(tmp_path / "static", container), container)
+        assert (library / "hdf5/plugin/libh5fhash.so").resolve().is_file()
