@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units hard every device lib paraview wheels clean
+.PHONY: demo test types units hard every device lib paraview wheels wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
@@ -63,6 +63,15 @@ wheels: .venv/.stamp $(PLATFORMS:%=wheel/%)
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	$(BIN)/python -m build --no-isolation --wheel --outdir dist benchmarks
 	ls -l dist
+
+# The decoder in the page of `fhash view`, which is committed: fhash_codec/views/page/fhash.wasm. Debian: clang-14, lld-14, wasi-libc,
+# libc++-14-dev-wasm32, libc++abi-14-dev-wasm32, libclang-rt-14-dev-wasm32.
+wasm: .venv/.stamp
+	$(BIN)/python setup.py -q wasm
+
+# The page of `fhash view` in Chromium with larger files, and its figures: build/view.
+view: .venv/.stamp
+	FHASH_VIEW=build/view $(BIN)/python -m pytest tests/codec/views/test_page.py
 
 wheel/%: .venv/.stamp
 	FHASH_TARGET=$(*D) $(BIN)/python setup.py -q build --build-base build/$(*F) bdist_wheel --plat-name $(*F) -d dist

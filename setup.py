@@ -6,14 +6,18 @@ the package ziglang is used (build_backend.py); it also compiles for other machi
 FHASH_TARGET names one by zig's words, such as aarch64-linux-musl (`make wheels`).
 """
 
+import hashlib
+import json
 import os
+import re
+import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from setuptools import Extension, setup
+from setuptools import Command, Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 from setuptools.errors import BaseError, CCompilerError, CompileError
@@ -65,6 +69,38 @@ THIRD_PARTY: list[tuple[str, str | None]] = [
 ]
 """Definitions by which a library exports nothing of third_party, but its own public functions."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
+
+
+WASM = Path("fhash_codec/views/page/fhash.wasm")
+"""The decoder of `fhash view`, and beside it in .json what it was made from (`make wasm`)."""
+WASM_FLAGS = [
+    "--target=wasm32-wasi",
+    "-msimd128",
+    "-DFHASH_SMALL",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fvisibility=hidden",
+    "-Wno-macro-redefined",
+    "-flto",
+    "-g0",
+]
+WASM_SMALL = [
+    ("HUF_FORCE_DECOMPRESS_X1", "1"),
+    ("ZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT", "1"),
+    ("YYJSON_DISABLE_NON_STANDARD", "1"),
+    ("YYJSON_DISABLE_UTILS", "1"),
+    ("YYJSON_DISABLE_FAST_FP_CONV", "1"),
+    ("yyjson_inline", "inline"),
+]
+"""Definitions by which third_party has one way of each thing instead of several."""
+WASM_CPP_FLAGS = ["-fno-threadsafe-statics", "-std=c++17", "-fno-exceptions", "-fno-rtti"]
+WASM_LINK_FLAGS = [
+    "-mexec-model=reactor",
+    "-Wl,-s,--gc-sections,--stack-first,--lto-O2,-z,stack-size=1048576",
+]
+WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
+"""Functions that a page has no use for: there are no paths, and nothing is encoded."""
 
 
 def use_zig() -> None:
@@ -139,6 +175,64 @@ class PlainWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
+class BuildWasm(Command):
+    """`wasm`: the functions of fhash.h for browsers, by Clang 14 and the libraries of wasi."""
+
+    description = "compile the decoder of the page of `fhash view`"
+    user_options: ClassVar[list[tuple[str, str | None, str]]] = []
+
+    def initialize_options(self) -> None:
+        """Nothing can be chosen."""
+
+    def finalize_options(self) -> None:
+        """Nothing can be chosen."""
+
+    def run(self) -> None:
+        build = Path("build/wasm")
+        build.mkdir(parents=True, exist_ok=True)
+        every = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
+        sources = [source for source in every if source.name != "hdf5_filter.cpp"]
+        headers = max(path.stat().st_mtime for path in [*FORMATS.rglob("*.h*"), Path(__file__)])
+
+        def compiled(source: Path) -> Path:
+            result = build / f"{source.name}.o"
+            if result.exists() and result.stat().st_mtime > max(source.stat().st_mtime, headers):
+                return result
+            # Most of the time of a first picture goes into compiling: -Os and -O2 were slower.
+            kind = ["-Oz"]
+            kind += [f"-D{name}={value}" for name, value in [*THIRD_PARTY, *WASM_SMALL]]
+            kind += [] if source.suffix == ".c" else WASM_CPP_FLAGS
+            clang = "clang-14" if source.suffix == ".c" else "clang++-14"
+            self._run(clang, *WASM_FLAGS, *kind, f"-I{FORMATS}", "-c", source, "-o", result)
+            return result
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            objects = list(pool.map(compiled, sources))
+        declared = re.findall(
+            r"FHASH_API [^;(]*?(fhash_\w+)\(", (FORMATS / "fhash.h").read_text("utf-8")
+        )
+        names = [*sorted({*declared, "fhash_open_page"} - WASM_LEFT_OUT), "malloc", "free"]
+        exports = [f"-Wl,--export={name}" for name in names]
+        self._run("clang++-14", *WASM_FLAGS, *WASM_LINK_FLAGS, *exports, *objects, "-o", WASM)
+        self._run("wasm-opt", "-Oz", "--enable-simd", "--strip-producers", WASM, "-o", WASM)
+        arrays = (FORMATS / "prior_bytes.inc").read_text("utf-8")
+        priors = []
+        for name, numbers in re.findall(r"(\w+)\[\w*\] = \{([^}]*)\}", arrays):
+            priors.append(WASM.with_name(f"{name.lower()}.bin"))
+            priors[-1].write_bytes(bytes(int(number, 0) for number in re.findall(r"\w+", numbers)))
+        read = sorted(
+            {*every, *FORMATS.rglob("*.hpp"), *FORMATS.rglob("*.h"), *FORMATS.rglob("*.inc")}
+        )
+        digests = {
+            path.as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in [*read, *priors, WASM]
+        }
+        WASM.with_suffix(".wasm.json").write_text(json.dumps(digests, indent=1) + "\n", "utf-8")
+
+    def _run(self, *words: str | Path) -> None:
+        subprocess.run([str(word) for word in words], check=True)
+
+
 def native(
     name: str, folder: Path, *, flags: tuple[str, ...] = (), link_flags: tuple[str, ...] = ()
 ) -> Extension:
@@ -167,6 +261,6 @@ setup(
         native("fhash_codec.native._codec", CODEC, flags=("-pthread",)),
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
-    cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel},
+    cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel, "wasm": BuildWasm},
     options={"build_ext": {"parallel": 3}},
 )

@@ -593,6 +593,22 @@ class Volume(Card, ArrayLike):
         again = partial(open, variable=self.variable, fill=self._asked_fill)
         return again, (self.container.reopening(),)
 
+    def view(self, height: int = 560) -> Any:
+        """Show the file in a notebook by the page of `fhash view`, `height` pixels high.
+
+        Raises MissingDependencyError without anywidget (`fhash[notebook]`), MissingInputError for a
+        file that is not on this machine, and InputError for one that is too large to be sent.
+        """
+        from fhash_codec.views.page import widget
+
+        return widget(self.path, height)
+
+    def _repr_html_(self) -> str:
+        """A table and a slice, for notebooks."""
+        from fhash_codec.views.page import html_of
+
+        return html_of(self)
+
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))
         return f"<fhash Volume '{self.name}' {sizes} {self.dtype} of {self.path}>"

@@ -31,6 +31,7 @@ COMMANDS = {
     "unpack": "make coded Zarr arrays of RUN.fhz, without coding again",
     "decode": "rebuild a region of RUN.fhz, at any time",
     "render": "draw a picture of RUN.fhz",
+    "view": "show RUN.fhz in a browser",
     "info": "say what RUN.fhz holds and how good it is",
     "serve": "give decoded values of RUN.fhz over HTTP, as Zarr, to any client",
     "export": "write the model of RUN.fhz in plain numbers, for any Zarr library",

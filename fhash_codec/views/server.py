@@ -1,4 +1,4 @@
-"""HTTP server of a Zarr view, with ranges of bytes."""
+"""HTTP server of a view, with ranges of bytes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ import socketserver
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, Protocol
 from urllib.parse import unquote, urlsplit
 
-from fhash_codec.views.view import ZarrView
 from fhash_formats.errors import FhashError, InputError
 
 UNSATISFIABLE = (-1, -1)
@@ -94,6 +93,25 @@ NEWS = Callable[[str], None]
 """Is told a line for each answer that is an error of the server."""
 
 
+class View(Protocol):
+    """Bytes by keys."""
+
+    hint: str
+    """Answer to a client that asks for an unknown key; `{url}` stands for that of the server."""
+
+    def tag_of(self, key: str) -> str:
+        """Text that differs where the bytes of a key may."""
+
+    def size(self, key: str) -> int | None:
+        """The number of bytes of a key; None where there is no such key."""
+
+    def kind(self, key: str) -> str:
+        """The media type of a key that there is."""
+
+    def pieces(self, key: str, first: int, end: int) -> Iterator[bytes | memoryview]:
+        """Yield the bytes of a key that there is, from `first` to before `end`."""
+
+
 class Server(ThreadingHTTPServer):
     """A server of one view; several clients are served at once.
 
@@ -112,7 +130,7 @@ class Server(ThreadingHTTPServer):
 
     def __init__(
         self,
-        view: ZarrView,
+        view: View,
         *,
         host: str = "127.0.0.1",
         port: int = 0,
@@ -259,15 +277,14 @@ class _Handler(BaseHTTPRequestHandler):
         key = unquote(self.path.partition("?")[0]).removeprefix("/")
         size = view.size(key)
         if size is None:
-            self._tell(HTTPStatus.NOT_FOUND, f"no such key; open {self.server.url} as Zarr v3")
+            self._tell(HTTPStatus.NOT_FOUND, view.hint.format(url=self.server.url))
             return
-        tag = f'"{_key_tag(view.tag, key)}"'
-        kind = "application/json" if view.is_document(key) else "application/octet-stream"
+        tag = f'"{_key_tag(view.tag_of(key), key)}"'
         headers = {
             "ETag": tag,
             "Accept-Ranges": "bytes",
             "Cache-Control": "no-cache",  # kept, but asked for again: another file may be served
-            "Content-Type": kind,
+            "Content-Type": view.kind(key),
         }
         if names_tag(self.headers.get("If-None-Match"), tag):
             self._send(HTTPStatus.NOT_MODIFIED, headers=headers)
@@ -290,16 +307,20 @@ class _Handler(BaseHTTPRequestHandler):
         if not body:
             self._send(status, headers=headers, length=end - first)
             return
-        data = self._bytes(key)
-        if data is not None:
-            self._send(status, memoryview(data)[first:end], headers=headers)
+        pieces = view.pieces(key, first, end)
+        start = self._first(key, pieces)
+        if start is not None:
+            self._send(status, start, headers=headers, length=end - first)
+            sent = len(start)
+            for piece in pieces:
+                self.wfile.write(piece)
+                sent += len(piece)
+            self.close_connection |= sent != end - first  # of a file that was cut meanwhile
 
-    def _bytes(self, key: str) -> bytes | None:
-        """The bytes of a key; None where they could not be had, which the client was told."""
+    def _first(self, key: str, pieces: Iterator[bytes | memoryview]) -> bytes | memoryview | None:
+        """The first piece of a key; None where it could not be had, which the client was told."""
         try:
-            data = self.server.view.get(key)
-            assert data is not None, "a key that has a size has bytes"
-            return data
+            return next(pieces, b"")
         except FhashError as error:
             line = str(error)
         except MemoryError:
@@ -332,7 +353,7 @@ class _Handler(BaseHTTPRequestHandler):
         headers: dict[str, str],
         length: int | None = None,
     ) -> None:
-        """Send an answer. length: bytes that a body would have, where none is sent."""
+        """Send an answer. length: bytes of the whole body, where `data` is not all of it."""
         self.send_response(status)
         # A request that could not be read has no headers.
         asking = getattr(self, "headers", None)

@@ -126,7 +126,10 @@ class ZarrView:
         names: name of the array of each volume, by the volume's name.
         arrays: the arrays by path, such as "density", "time" and "lod/1/density".
         tag: hexadecimal text that differs where any bytes of the hierarchy may.
+        hint: what a client is told that asks for an unknown key.
     """
+
+    hint = "no such key; open {url} as Zarr v3"
 
     def __init__(self, volumes: Mapping[str, Volume]) -> None:
         self.volumes = volumes
@@ -185,6 +188,20 @@ class ZarrView:
     def is_document(self, key: str) -> bool:
         """Whether a key is a metadata document, whose bytes are at hand."""
         return key in self._documents
+
+    def tag_of(self, key: str) -> str:
+        """Text that differs where the bytes of a key may: that of the hierarchy."""
+        return self.tag
+
+    def kind(self, key: str) -> str:
+        """The media type of a key."""
+        return "application/json" if self.is_document(key) else "application/octet-stream"
+
+    def pieces(self, key: str, first: int, end: int) -> Iterator[memoryview]:
+        """Yield the bytes of a key that there is, from `first` to before `end`, as `get` does."""
+        data = self.get(key)
+        assert data is not None, "a key that has a size has bytes"
+        yield memoryview(data)[first:end]
 
     def listing(self, prefix: str = "") -> Iterator[str]:
         """Yield every key that begins with a prefix: the documents, then chunk after chunk."""

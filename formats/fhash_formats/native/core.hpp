@@ -18,13 +18,17 @@ constexpr std::int64_t FHASH_ABI = 17;
 #define FHASH_RESTRICT __restrict
 #else
 #define FHASH_EXPORT extern "C" __attribute__((visibility("default")))
+#if defined(FHASH_SMALL)  // a library that is loaded over a network (setup.py)
+#define FHASH_INLINE inline
+#else
 #define FHASH_INLINE inline __attribute__((always_inline))
+#endif
 #define FHASH_RESTRICT __restrict__
 #endif
 
 // FHASH_LAMBDA after the parameters of a lambda: always inlined, so that it is compiled for the
 // machine of the clone that contains it.
-#if defined(_MSC_VER)
+#if defined(_MSC_VER) || defined(FHASH_SMALL)
 #define FHASH_LAMBDA
 #else
 #define FHASH_LAMBDA __attribute__((always_inline))

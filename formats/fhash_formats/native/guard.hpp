@@ -5,17 +5,21 @@
 // from it would end the process.
 #pragma once
 
+#include "core.hpp"
+
+#if defined(__cpp_exceptions)
 #include <new>
 #include <stdexcept>
-
-#include "core.hpp"
+#endif
 
 namespace {
 
 const std::int64_t NO_MEMORY = -2;
 
-// The result of `work`, or NO_MEMORY where it ran out of memory.
+// The result of `work`, or NO_MEMORY where it ran out of memory. Without exceptions (WebAssembly)
+// the instance ends there, and whoever called it makes another one.
 template <class Work> FHASH_INLINE std::int64_t guarded(Work work) {
+#if defined(__cpp_exceptions)
     try {
         return work();
     } catch (const std::bad_alloc&) {
@@ -23,6 +27,9 @@ template <class Work> FHASH_INLINE std::int64_t guarded(Work work) {
     } catch (const std::length_error&) {
         return NO_MEMORY;
     }
+#else
+    return work();
+#endif
 }
 
 }  // namespace

@@ -18,7 +18,7 @@ inline double real(Half value) { return (double)from_half(value.bits); }
 template <class T> double real(T value) { return (double)value; }
 
 template <class T> constexpr bool is_real = std::is_floating_point<T>::value;
-template <> constexpr bool is_real<Half> = true;
+template <> inline constexpr bool is_real<Half> = true;
 
 // A number in another type: rounded to the nearest, ties to even, and for integers within the type;
 // NaN becomes 0 there.

@@ -1,4 +1,5 @@
 // The files of the priors (priors.hpp).
+#if !defined(__wasm__)  // there wasm.cpp fetches them
 #include "priors.hpp"
 
 namespace fhash {
@@ -16,3 +17,4 @@ const uint8_t* prior_bytes(int number, size_t* size) {
 }
 
 }  // namespace fhash
+#endif
