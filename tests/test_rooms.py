@@ -28,11 +28,11 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("writers",),
     ),
     "fhash_formats.transform": (
-        ("coder", "head", "values"),
+        ("head", "values"),
         ("predict", "spec"),
         ("tile_format",),
         ("tile",),
-        ("chunk", "stream"),
+        ("stream",),
         ("numcodecs_codec", "zarr_codec"),
     ),
     "fhash_formats.container": (

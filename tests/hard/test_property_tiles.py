@@ -25,11 +25,26 @@ from reference.sections import labelled_stream
 from reference.transforms import Transform, band_table
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.chunk import decode_chunk, encode_chunk
-from fhash_formats.transform.coder import MAX_LABELS, MaskLevels, decode_block, encode_block
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
-from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec, fit_basis
-from fhash_formats.transform.tile import Coding, decode_tile, decode_tile_mask, encode_tile
+from fhash_formats.transform.spec import (
+    KINDS,
+    MAX_LABELS,
+    WAVELETS,
+    AxisTransform,
+    MaskLevels,
+    TransformSpec,
+    decode_block,
+    encode_block,
+    fit_basis,
+)
+from fhash_formats.transform.tile import (
+    Coding,
+    decode_chunk,
+    decode_tile,
+    decode_tile_mask,
+    encode_chunk,
+    encode_tile,
+)
 from fhash_formats.transform.tile_format import TileSettings
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.support.arrays import Integers, Mask, Values
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.values import cast, pieces
 from reference.kernels import library
 

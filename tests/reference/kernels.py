@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Integers, Mask
-from fhash_formats.transform.coder import MaskLevels, checked
+from fhash_formats.support.values import Integers, Mask
 from fhash_formats.transform.predict import CLASSES, Predictor, Tap
+from fhash_formats.transform.spec import MaskLevels, checked
 
 ARRAY, INTEGER, REAL = native.ARRAY, native.INTEGER, native.REAL
 _SIZED = (ARRAY, INTEGER)

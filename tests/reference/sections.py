@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.support.arrays import Integers, Mask, Values
-from fhash_formats.transform.coder import MAX_LABELS
+from fhash_formats.support.values import Integers, Mask, Values
+from fhash_formats.transform.spec import MAX_LABELS
 from fhash_formats.transform.tile_format import (
     EMPTY,
     FAST,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Integers, Values
+from fhash_formats.support.values import Integers, Values
 from fhash_formats.transform.spec import AXES, KINDS, AxisTransform, TransformSpec
 from reference.kernels import COLUMNS, NO_REFERENCE, Table, library
 

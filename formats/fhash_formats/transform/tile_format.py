@@ -13,16 +13,18 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.support.arrays import Values
-from fhash_formats.support.values import is_wide_integer, is_within
-from fhash_formats.transform.coder import (
+from fhash_formats.support.values import Values, is_wide_integer, is_within
+from fhash_formats.transform.head import NeighbourHead
+from fhash_formats.transform.predict import Predictor, tap_count
+from fhash_formats.transform.spec import (
+    KINDS,
+    AxisTransform,
+    Basis,
     MaskLevels,
+    TransformSpec,
     decode_block,
     encode_block,
 )
-from fhash_formats.transform.head import NeighbourHead
-from fhash_formats.transform.predict import Predictor, tap_count
-from fhash_formats.transform.spec import KINDS, AxisTransform, Basis, TransformSpec
 
 OFFSETS = 6
 """Reconstruction offsets."""

@@ -16,8 +16,7 @@ from reference.tile import decode_tile
 
 from fhash_formats import native
 from fhash_formats.native import crc32c
-from fhash_formats.transform.coder import MaskLevels
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.spec import AxisTransform, MaskLevels, TransformSpec
 from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 

@@ -16,20 +16,19 @@ from numpy.typing import NDArray
 from tiles import SETTINGS, SHAPE, same, wave
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError, UnsupportedFileError
-from fhash_formats.transform.chunk import decode_chunk, encode_chunk, tile_shape
-from fhash_formats.transform.coder import MaskLevels
 from fhash_formats.transform.spec import (
     MAX_DEPTH,
     MAX_EXPONENT,
     MAX_LENGTH,
     AxisTransform,
     Basis,
+    MaskLevels,
     TransformSpec,
     _dct,
     fit_basis,
 )
 from fhash_formats.transform.stream import TILE_AXES, ArrayAxes, TransformCoder, take_axes
-from fhash_formats.transform.tile import Coding, encode_tile
+from fhash_formats.transform.tile import Coding, decode_chunk, encode_chunk, encode_tile, tile_shape
 from fhash_formats.transform.tile_format import KIND, LABELS, TRANSFORMED, TileSettings
 
 FLOATS = ["f2", "f4", "f8", ">f4"]

@@ -32,8 +32,15 @@ from reference.masks import mask_levels
 from reference.transforms import band_table
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.coder import MaskLevels, decode_block, encode_block
-from fhash_formats.transform.spec import WAVELETS, AxisTransform, TransformSpec, fit_basis
+from fhash_formats.transform.spec import (
+    WAVELETS,
+    AxisTransform,
+    MaskLevels,
+    TransformSpec,
+    decode_block,
+    encode_block,
+    fit_basis,
+)
 
 Integers = NDArray[np.int32]
 Shape = tuple[int, ...]

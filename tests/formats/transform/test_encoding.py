@@ -26,8 +26,7 @@ from tiles import (
 )
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
-from fhash_formats.transform.coder import MaskLevels
-from fhash_formats.transform.spec import AxisTransform, Basis, TransformSpec
+from fhash_formats.transform.spec import AxisTransform, Basis, MaskLevels, TransformSpec
 from fhash_formats.transform.tile import (
     DENSITIES,
     CodedTile,

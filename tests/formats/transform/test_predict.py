@@ -35,7 +35,6 @@ from tiles import SETTINGS, Four, predictor_of, random_head, resealed, same, str
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
 from fhash_formats.support.values import DTYPES
-from fhash_formats.transform.coder import MaskLevels
 from fhash_formats.transform.predict import (
     MAX_PREDICTED_INTEGER,
     Predictor,
@@ -43,6 +42,7 @@ from fhash_formats.transform.predict import (
     integers_of,
     passes_of,
 )
+from fhash_formats.transform.spec import MaskLevels
 from fhash_formats.transform.tile import Coding, decode_tile, decode_tile_mask, encode_tile
 from fhash_formats.transform.tile_format import (
     DIFFERENCES,

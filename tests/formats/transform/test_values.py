@@ -28,9 +28,8 @@ from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
 from zarr.codecs.numcodecs import FixedScaleOffset
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.chunk import encode_chunk
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
-from fhash_formats.transform.tile import encode_tile
+from fhash_formats.transform.tile import encode_chunk, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import PIECE, all_finite, cast
 from fhash_formats.transform.zarr_codec import TransformCodec

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from specs import spec_of
 
 from fhash_formats.native import crc32c
-from fhash_formats.transform.coder import MaskLevels
 from fhash_formats.transform.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
 from fhash_formats.transform.predict import Predictor, passes_of
+from fhash_formats.transform.spec import MaskLevels
 from fhash_formats.transform.tile import Coding, encode_tile, exact_tile
 from fhash_formats.transform.tile_format import TileSettings
 
