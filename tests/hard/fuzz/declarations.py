@@ -15,7 +15,7 @@ __all__ = ["CALL", "exported", "header"]
 CALL = re.compile(r"\bfhash_\w+")
 """Names of functions in the text of a target."""
 
-_EXPORTED = re.compile(r"FHASH_(?:EXPORT|API)\s+(\S+)\s+(fhash_\w+)\(([^)]*)\)")
+_EXPORTED = re.compile(r"FHASH_EXPORT\s+(\S+)\s+(fhash_\w+)\(([^)]*)\)")
 _MACRO = re.compile(r"^#define (\w+)(?:\(([^)]*)\))?[ \t]+(\S.*)$", re.MULTILINE)
 
 
