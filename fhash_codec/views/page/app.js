@@ -16,7 +16,7 @@ const COARSE = 2 ** 16;
 const MOST_VERTICES = 2 ** 27;
 const BINS = 512;
 const COUNTED = 2 ** 18;
-const MOST_COUNTED = 64 * 2 ** 20;
+const MOST_COUNTED = 16 * 2 ** 20; // bytes of files of which more is read than what is shown
 const MOST_PIXELS = 2 ** 22;
 const BAND_MS = 40;
 
