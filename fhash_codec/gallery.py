@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
 from fhash_codec.simulation.simulate import simulate
 from fhash_formats.series import ArraySeries, Coordinate, Series
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 DAY = 86400.0
 """Seconds of a day."""

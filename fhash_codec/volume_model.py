@@ -19,7 +19,7 @@ from fhash_formats.container import Container
 from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, RESIDUAL, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
-from fhash_formats.support.arrays import Mask
+from fhash_formats.support.values import Mask
 
 if TYPE_CHECKING:
     from fhash_codec.paper.model import PaperModel

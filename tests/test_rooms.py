@@ -28,12 +28,11 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("writers",),
     ),
     "fhash_formats.transform": (
-        ("coder", "head", "values"),
+        ("head", "values"),
         ("predict", "spec"),
-        ("lifting", "tile_format"),
-        ("decoding",),
-        ("encoding",),
-        ("chunk", "stream"),
+        ("tile_format",),
+        ("tile",),
+        ("stream",),
         ("numcodecs_codec", "zarr_codec"),
     ),
     "fhash_formats.container": (

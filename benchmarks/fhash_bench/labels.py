@@ -21,7 +21,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.series import ArraySeries, Series
-from fhash_formats.transform.chunk import encode_chunk
+from fhash_formats.transform.tile import encode_chunk
 
 Labels = npt.NDArray[Any]
 Shape = tuple[int, int, int, int]

@@ -34,7 +34,7 @@ from fhash_codec.paper.train import plan_training
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
-from fhash_formats.support.arrays import Mask
+from fhash_formats.support.values import Mask
 
 POINTS = 1 << 19
 """Points of a measurement."""

@@ -35,9 +35,8 @@ from fhash_formats.container.header import COMPACT, NOT_STORED, PLAIN_FEATURE, S
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
-from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import chunk_region
-from fhash_formats.support.values import exact_number, is_within
+from fhash_formats.support.values import Values, exact_number, is_within
 from fhash_formats.transform.tile import TRELLIS_WEIGHT, WEIGHT, CodedTile, decode_tile
 from fhash_formats.transform.tile_format import TileSettings, parse_stream
 

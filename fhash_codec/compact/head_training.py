@@ -14,9 +14,8 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.measure.errors import pointer
-from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import usable_threads
-from fhash_formats.transform.coder import checked
+from fhash_formats.support.values import Double, Single
 from fhash_formats.transform.head import (
     CROSS,
     INPUTS,
@@ -29,6 +28,7 @@ from fhash_formats.transform.head import (
     Scaled,
     layer_inputs,
 )
+from fhash_formats.transform.spec import checked
 
 BATCH_VOXELS = 4096
 """Voxels of a training batch."""

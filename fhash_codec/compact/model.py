@@ -17,8 +17,8 @@ from fhash_codec.measure.value_range import decoded_type
 from fhash_formats.container import Container, StoredArray
 from fhash_formats.container.header import PLAIN_FEATURE, TABLE
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Double
 from fhash_formats.support.threads import chunk_region, common_part
+from fhash_formats.support.values import Double
 from fhash_formats.transform.head import Layer, NeighbourHead
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import cast

@@ -43,8 +43,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
 from fhash_codec.measure.value_range import ValueRange, mean_of
 from fhash_codec.progress import Parts, Progress, stage
-from fhash_formats.transform.coder import MAX_LABELS, MaskLevels
-from fhash_formats.transform.spec import MAX_LENGTH
+from fhash_formats.transform.spec import MAX_LABELS, MAX_LENGTH, MaskLevels
 from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.tile_format import (
     FEW,

@@ -14,9 +14,8 @@ from fhash_codec.compact.attempt import sub_tile
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Tile
 from fhash_codec.compact.transform import gram_of, usual_transform
-from fhash_formats.support.arrays import Mask
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.transform.coder import encode_block
+from fhash_formats.support.values import Mask
 from fhash_formats.transform.predict import (
     MAX_WEIGHT,
     WEIGHT_UNIT,
@@ -25,6 +24,7 @@ from fhash_formats.transform.predict import (
     integers_of,
     passes_of,
 )
+from fhash_formats.transform.spec import encode_block
 from fhash_formats.transform.tile import predicted_size
 from fhash_formats.transform.tile_format import Shape, TileSettings
 

@@ -29,9 +29,9 @@ from fhash_codec.compact.tiles import (
     total,
 )
 from fhash_codec.features.features import Feature, Interval, Isosurface, Segmentation
-from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead
-from fhash_formats.transform.coder import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
+from fhash_formats.support.values import Values
+from fhash_formats.transform.spec import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
 from fhash_formats.transform.tile import WEIGHT, filled, foretell, forward, plain_step
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import all_finite

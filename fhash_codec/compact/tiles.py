@@ -18,8 +18,8 @@ from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.series import Series, step_blocks
-from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.threads import chunk_region, map_ahead, one_ahead, usable_threads
+from fhash_formats.support.values import Mask, Values
 from fhash_formats.transform import tile as coder
 from fhash_formats.transform.tile import WEIGHT, CodedTile, decode_tile, encode_tile, exact_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings

@@ -19,8 +19,14 @@ from fhash_codec.compact.sample import PricedSample, spread_order
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome, Tile, code
 from fhash_codec.measure.errors import BULK_SHARE, pointer
 from fhash_codec.progress import stage
-from fhash_formats.transform.coder import checked
-from fhash_formats.transform.spec import MAX_LENGTH, AxisTransform, Basis, TransformSpec, fit_basis
+from fhash_formats.transform.spec import (
+    MAX_LENGTH,
+    AxisTransform,
+    Basis,
+    TransformSpec,
+    checked,
+    fit_basis,
+)
 from fhash_formats.transform.tile import forward, plain_step
 from fhash_formats.transform.tile_format import Shape, TileSettings
 

@@ -21,7 +21,7 @@ from fhash_codec.measure.value_range import decoded_type
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import Series
-from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import Values
 
 LAYOUTS = {
     "frame": "(z, y, x) of each step",

@@ -38,7 +38,7 @@ from fhash_codec.rendering.scenes import (
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import Series
-from fhash_formats.support.arrays import Single, Values
+from fhash_formats.support.values import Single, Values
 
 LEVELS = (1, 2, 3)
 """Levels of detail."""

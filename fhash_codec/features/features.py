@@ -23,8 +23,7 @@ from fhash_codec.progress import Progress
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Series, step_blocks
-from fhash_formats.support.arrays import Longs
-from fhash_formats.support.values import exact_number, is_wide_integer
+from fhash_formats.support.values import Longs, exact_number, is_wide_integer
 
 Frame = npt.NDArray[Any]
 """Values (z, y, x) of one step."""

@@ -15,8 +15,7 @@ from fhash_codec.measure.value_range import power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Series
-from fhash_formats.support.arrays import Longs
-from fhash_formats.support.values import integer_origin, is_wide_integer
+from fhash_formats.support.values import Longs, integer_origin, is_wide_integer
 from fhash_formats.transform.values import about_origin
 
 FORMS = "all, every:K, auto:N or a list such as 0,4,9"

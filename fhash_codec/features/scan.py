@@ -17,9 +17,8 @@ from fhash_codec.measure.value_range import PIECE, Mean, Ranks, RanksSpan, Value
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults
-from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead, one_ahead, thread_pool
-from fhash_formats.support.values import exact_number
+from fhash_formats.support.values import Values, exact_number
 
 HELD_BYTES = 1 << 28
 """Bytes of a series whose frames stay in memory after the scan, at most."""

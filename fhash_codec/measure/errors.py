@@ -17,9 +17,8 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.measure.value_range import Ranks, ValueRange, pieces, power_of_two
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double, Mask, Values
 from fhash_formats.support.threads import in_threads, usable_threads
-from fhash_formats.support.values import exact_number, is_wide_integer
+from fhash_formats.support.values import Double, Mask, Values, exact_number, is_wide_integer
 
 LANES = 256
 """Sums that run side by side."""

@@ -28,8 +28,8 @@ from fhash_codec.measure.value_range import ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress, attribute, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import step_blocks
-from fhash_formats.support.arrays import Double, Mask, Values
 from fhash_formats.support.threads import share_out, usable_threads
+from fhash_formats.support.values import Double, Mask, Values
 
 SIGMA = 1.5
 """Standard deviation of the Gaussian window, in vertices."""

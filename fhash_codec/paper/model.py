@@ -20,8 +20,8 @@ from fhash_codec.paper.network import Network, RankedBits, Resolution, SparseFra
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
-from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import share_out, usable_threads
+from fhash_formats.support.values import Double, Single
 
 AXES = ("key_index", "z", "y", "x")
 """Names of the coordinates of a point, in order."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import TableSource
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Longs, Mask, Single
+from fhash_formats.support.values import Longs, Mask, Single
 
 Resolution = tuple[int, int, int, int]
 """Vertices per axis of one level, (t, z, y, x)."""

@@ -29,7 +29,7 @@ from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE, LAYERS
 from fhash_formats.container.reader import layer_shapes
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Longs, Mask, Single
+from fhash_formats.support.values import Longs, Mask, Single
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 

@@ -38,8 +38,8 @@ from fhash_codec.paper.tables import (
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.array import transform_codecs
-from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import thread_pool
+from fhash_formats.support.values import Single
 from fhash_formats.transform.tile import OFFSETS, WEIGHT
 from fhash_formats.transform.tile_format import TileSettings
 

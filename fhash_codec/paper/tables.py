@@ -27,8 +27,8 @@ from fhash_formats.container import ContainerWriter, shard_shape
 from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.header import LAYERS, MASK_ARRAY, MASK_FEATURES
 from fhash_formats.container.stored import ChunkCache
-from fhash_formats.support.arrays import Mask, Single
 from fhash_formats.support.threads import chunk_region
+from fhash_formats.support.values import Mask, Single
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.tile import WEIGHT, Coding, decode_tile, encode_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings

@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Table, Task
-from fhash_formats.support.arrays import Mask, Single
 from fhash_formats.support.threads import in_threads
+from fhash_formats.support.values import Mask, Single
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

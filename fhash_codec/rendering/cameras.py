@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fhash_codec.rendering.grid import Grid, vector
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "iso": ((1, 1, 1), (0, 0, 1)),

@@ -16,7 +16,7 @@ from PIL import ImageColor
 
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 WHITE = (0.9505, 1.0, 1.089)
 """The white point D65 in XYZ, rounded as in VTK."""

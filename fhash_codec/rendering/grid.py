@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 if TYPE_CHECKING:
     from fhash_codec.volume import Volume

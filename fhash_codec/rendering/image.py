@@ -40,8 +40,8 @@ from fhash_codec.rendering.scenes import DIGEST_KEY, SCENE_KEY, SOURCE_KEY, Effe
 from fhash_codec.rendering.view import Body, Edge, edges, outer_edges
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
-from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.files import check_output, replacing_all
+from fhash_formats.support.values import Double, Single
 
 if TYPE_CHECKING:
     from PIL.Image import Image as PicturesImage

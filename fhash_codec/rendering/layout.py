@@ -18,7 +18,7 @@ from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.scenes import Effects, LegendEntry, Scene
 from fhash_codec.rendering.view import Edge, outer_edges
 from fhash_formats.series import Coordinate
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont

@@ -37,8 +37,8 @@ from fhash_codec.rendering.transfer_function import about
 from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import in_threads
+from fhash_formats.support.values import Double, Single
 
 FLATTEST = 1e-6
 """Gradient, as a share of the value range per vertex, at which shading has faded by half. The

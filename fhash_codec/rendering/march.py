@@ -28,8 +28,8 @@ from fhash_codec.rendering.march_task import (
     extinctions_in,
 )
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import in_threads, usable_threads
+from fhash_formats.support.values import Single
 
 MAX_SURFACES = 64
 """Surfaces of a picture, at most: FHASH_SURFACES."""

@@ -18,7 +18,7 @@ from fhash_codec.rendering.transfer_function import about
 from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double, Single
+from fhash_formats.support.values import Double, Single
 
 Array = Any
 """An array of numpy or a tensor of torch."""

@@ -30,7 +30,7 @@ from fhash_codec.rendering.transfer_function import Histogram, TransferFunction,
 from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 
 def arrays_on(device: str) -> Arrays:

@@ -20,7 +20,7 @@ from fhash_codec.rendering.scenes import Camera, Effects, Scene, TransferFunctio
 from fhash_codec.times import time_range
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, RegionError
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 TIME_AND_CAMERA = ("camera", "step", "time")
 """Fields of a scene that an animation sets by itself."""

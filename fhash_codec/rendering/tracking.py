@@ -29,7 +29,7 @@ from fhash_codec.rendering.transfer_function import opacity_preset, raised
 from fhash_codec.volume import Volume, feature_names, holds_features_apart
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#555555")
 """Default colours of features: Okabe and Ito chose them to be told apart by colour-blind people."""

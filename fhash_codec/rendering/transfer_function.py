@@ -24,7 +24,7 @@ from fhash_codec.rendering.colours import (
 )
 from fhash_codec.rendering.scenes import TransferFunctionSpec
 from fhash_formats.errors import FhashWarning, InputError, suggestion
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 Range = tuple[float, float]
 Histogram = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]

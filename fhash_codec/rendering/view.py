@@ -14,7 +14,7 @@ from fhash_codec.rendering.grid import Grid, Warp
 from fhash_codec.rendering.scenes import Clip
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 SNAP = 1e-6
 """Distance from a vertex, in vertices, at which a clip's end is taken for the vertex: coordinates

@@ -17,8 +17,7 @@ from fhash_codec.compact.goal import promise
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import Check, Finding, Run, environment
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Mask, Values
-from fhash_formats.support.values import is_wide_integer
+from fhash_formats.support.values import Mask, Values, is_wide_integer
 
 N_REGIONS = 6
 """Random regions of each run."""

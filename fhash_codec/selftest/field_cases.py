@@ -14,7 +14,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.selftest.case import Case, Finding, Run
 from fhash_formats.errors import FhashError, RegionError
 from fhash_formats.series import AXIS_NAMES, ArraySeries, Coordinate
-from fhash_formats.support.arrays import Double, Values
+from fhash_formats.support.values import Double, Values
 
 Shape = tuple[int, int, int, int]
 

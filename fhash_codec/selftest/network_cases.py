@@ -21,7 +21,7 @@ from fhash_codec.selftest.case import Case, Check, Finding, Run, as_floats
 from fhash_codec.selftest.field_cases import Settings, noise, single, spike, waves
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 UNIT = 2.0**-24
 """Largest relative error of one float32 rounding."""

@@ -18,7 +18,7 @@ from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest.case import Case, Check, Finding, Run
 from fhash_codec.selftest.field_cases import Settings, Shape, series, single, waves
 from fhash_formats.series import ArraySeries
-from fhash_formats.support.arrays import Double
+from fhash_formats.support.values import Double
 
 SNAP = 1e-9
 """Distance from a vertex, in vertex spacings, below which a coordinate is that of the vertex."""

@@ -32,7 +32,7 @@ from fhash_codec.selftest.field_cases import (
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import ArraySeries, Series
-from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import Values
 
 INTEGERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
 

@@ -39,7 +39,7 @@ from fhash_formats.readers.zarr_coded import CodedArray, coded_names, open_coded
 from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 from fhash_formats.support.values import exact_number, json_attributes
-from fhash_formats.transform.chunk import encode_chunk
+from fhash_formats.transform.tile import encode_chunk
 
 SHARD_BYTES = 1 << 30
 """Decoded bytes of a shard at most; its coded bytes, which are fewer, are held together."""

@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 
 from fhash_formats import native
-from fhash_formats.transform.chunk import DEFAULT_EFFORT, Quality, check_effort
+from fhash_formats.transform.tile import DEFAULT_EFFORT, Quality, check_effort
 
 FILTER = 34274
 """Number of the filter (native/hdf5_filter.cpp), from the range for private use."""

@@ -19,7 +19,7 @@ import xarray as xr
 from fhash_formats.errors import InputError
 from fhash_formats.hdf5 import FILTER, Transform
 from fhash_formats.native import FOLDER, crc32c
-from fhash_formats.transform.chunk import decode_chunk
+from fhash_formats.transform.tile import decode_chunk
 
 TYPES = ("float32", "float16", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32")
 TYPES += ("int64", "uint64", ">f4", ">f8", ">i2", ">u8")

@@ -63,7 +63,7 @@ class Refused(Exception):
 
 
 def library() -> ctypes.CDLL:
-    loaded = ctypes.CDLL(str(Path(native.__file__).with_name("_core.so")))
+    loaded = ctypes.CDLL(native.library()._name)
     for name, result, arguments in (
         ("context_create", _P, (ctypes.c_uint64, _I)),
         ("context_destroy", None, (_P,)),

@@ -31,7 +31,7 @@ def test_a_plain_install_holds_no_heavy_package(site: Path, tmp_path: Path) -> N
 
 def test_the_libraries_of_the_wheel_are_loaded(site: Path, tmp_path: Path) -> None:
     script = (
-        "import fhash_formats.native, fhash_codec.native, fhash_codec.native.network;"
+        "import fhash_formats.hdf5, fhash_codec.native, fhash_codec.native.network;"
         "print(fhash_formats.native.library() is not None,"
         " fhash_codec.native.library() is not None,"
         " fhash_codec.native.network.library() is not None, fhash_codec.__file__)"

@@ -26,6 +26,7 @@ from documents import (
     without,
 )
 from mutated_tiles import CODED_FEATURES, PLAIN, is_coded, settings_of, shard_of
+from reference.sections import pack_planes
 
 from fhash_formats.container.array import Sharding
 from fhash_formats.container.hierarchy import array_path
@@ -36,7 +37,6 @@ from fhash_formats.transform.tile_format import (
     MASKED,
     PREDICTED,
     TRANSFORMED,
-    pack_planes,
     seal,
     varint,
 )

@@ -27,16 +27,16 @@ from documents import (
     replaced,
     stored,
 )
+from reference.sections import pack_planes
 
 from fhash_formats.container.array import ArrayMetadata, Sharding, pack_index, parse_index
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
 from fhash_formats.errors import InputError
 from fhash_formats.native import crc32c
-from fhash_formats.transform.chunk import NO_TRANSFORM
-from fhash_formats.transform.coder import MAX_LABELS
 from fhash_formats.transform.head import Layer, NeighbourHead, layer_inputs
 from fhash_formats.transform.predict import passes_of
-from fhash_formats.transform.spec import Basis
+from fhash_formats.transform.spec import MAX_LABELS, Basis
+from fhash_formats.transform.tile import NO_TRANSFORM
 from fhash_formats.transform.tile_format import (
     KIND,
     LABELS,
@@ -47,7 +47,6 @@ from fhash_formats.transform.tile_format import (
     TRANSFORMED,
     TileSettings,
     TileStream,
-    pack_planes,
     parse_stream,
     read_varint,
     seal,

@@ -61,10 +61,10 @@ layer-rounding formats/fhash_formats/container/growing.py
 tuple(-(-n // length) for n => tuple(max(n // length, 1) for n
 lost-sync formats/fhash_formats/support/files.py
 _sync(output.temporary) => pass
-band-axis formats/fhash_formats/transform/lifting.py
-(0, int(key.z > 1), 0, 0) => (int(key.z > 1), 0, 0, 0)
-final-clip formats/fhash_formats/transform/decoding.py
-clipped(decoded, settings.low, settings.high) if settings.clip else decoded => decoded
+band-axis formats/fhash_formats/native/plan.cpp
+return refer(coarser, {0, 0, along_y > 1, 0}); => return refer(coarser, {0, along_y > 1, 0, 0});
+final-clip formats/fhash_formats/native/numbers.hpp
+const O raised = values[i] < low ? low : values[i]; => const O raised = values[i];
 axes-back formats/fhash_formats/transform/stream.py
 ordered.transpose(np.argsort(self._order)) => ordered.transpose(self._order)
 coder-sign formats/fhash_formats/native/coder.cpp

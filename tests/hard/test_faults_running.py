@@ -328,7 +328,7 @@ def test_a_source_that_may_not_be_read_is_said_in_one_line(
 
 PLACES = [
     ("encode compact", "fhash_codec.features.scan", "row_sums"),
-    ("encode compact", "fhash_formats.transform.tile", "encode_integers"),
+    ("encode compact", "fhash_formats.transform.tile", "_coded"),
     ("encode compact", "fhash_codec.compact.encode", "code"),
     ("encode compact", "fhash_codec.encoding", "measure"),
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),

@@ -13,27 +13,39 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from properties import NUMBERS, Draw, arrays, looking, same
-
-from fhash_formats.errors import InputError
-from fhash_formats.transform.chunk import decode_chunk, encode_chunk
-from fhash_formats.transform.coder import (
+from reference.kernels import (
     MAX_INTEGER,
-    MAX_LABELS,
-    MaskLevels,
-    decode_block,
     decode_integers,
     decode_labels,
-    encode_block,
     encode_integers,
     encode_labels,
     single_band,
 )
-from fhash_formats.transform.tile import decode_tile, decode_tile_mask
-from fhash_formats.transform.tile import Coding, encode_tile
-from fhash_formats.transform.lifting import Transform, band_table
+from reference.sections import labelled_stream
+from reference.transforms import Transform, band_table
+
+from fhash_formats.errors import InputError
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
-from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec, fit_basis
-from fhash_formats.transform.tile_format import TileSettings, labelled_stream
+from fhash_formats.transform.spec import (
+    KINDS,
+    MAX_LABELS,
+    WAVELETS,
+    AxisTransform,
+    MaskLevels,
+    TransformSpec,
+    decode_block,
+    encode_block,
+    fit_basis,
+)
+from fhash_formats.transform.tile import (
+    Coding,
+    decode_chunk,
+    decode_tile,
+    decode_tile_mask,
+    encode_chunk,
+    encode_tile,
+)
+from fhash_formats.transform.tile_format import TileSettings
 
 
 @st.composite

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats import native
-from fhash_formats.support.arrays import Integers, Mask, Values
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.values import cast, pieces
+from reference.kernels import library
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""
@@ -39,7 +39,7 @@ def quantise(
     integers = np.empty(coefficients.shape, np.int32)
     scaled = np.empty(coefficients.shape, np.float32)
     source = np.ascontiguousarray(coefficients)
-    getattr(native.library(), f"fhash_quantise_f{width}")(
+    getattr(library(), f"fhash_quantise_f{width}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
         *(ctypes.c_double(number) for number in (scale, ROUNDING, LARGEST)),
@@ -67,7 +67,7 @@ def dequantise(
     kind: np.dtype[Any] = np.dtype(dtype)
     shifts = np.array(offsets, dtype=np.float64) / OFFSET_UNIT
     result, source = np.empty(integers.shape, kind), np.ascontiguousarray(integers)
-    getattr(native.library(), f"fhash_dequantise_f{kind.itemsize * 8}")(
+    getattr(library(), f"fhash_dequantise_f{kind.itemsize * 8}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
         ctypes.c_double(step),
@@ -244,7 +244,7 @@ def free_values(
 def _native(name: str, *types: np.dtype[Any]) -> Any:
     """The native function for arrays of these types, each float32 or float64."""
     ends = [_NATIVE_TYPES[kind] for kind in types]
-    return getattr(native.library(), "_".join(["fhash", name, *ends]))
+    return getattr(library(), "_".join(["fhash", name, *ends]))
 
 
 def _pointers(*arrays: Values | None) -> list[ctypes.c_void_p]:

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.coder import fast_prior
 from reference.adaptive import Adaptive, clamp, log16
 from reference.bands import Band
+from reference.kernels import fast_prior
 from reference.labels import number_in
 
 LANES, BLOCK, LEVELS = 8, 16, 24

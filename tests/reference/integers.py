@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.coder import prior_state
 from reference.adaptive import Adaptive, clamp, log16, squashed
 from reference.bands import Band, single_band
+from reference.kernels import prior_state
 
 KINDS, LEVELS, DECISIONS = 64, 128, 16
 UNARY = 14

@@ -15,9 +15,90 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Integers, Mask
-from fhash_formats.transform.coder import MaskLevels, checked
+from fhash_formats.support.values import Integers, Mask
 from fhash_formats.transform.predict import CLASSES, Predictor, Tap
+from fhash_formats.transform.spec import MaskLevels, checked
+
+ARRAY, INTEGER, REAL = native.ARRAY, native.INTEGER, native.REAL
+_SIZED = (ARRAY, INTEGER)
+_STATE = _SIZED * 3
+"""Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
+_TRANSFORM = (ARRAY,) * 9
+_RECONSTRUCT = (*_TRANSFORM, ARRAY)
+_QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
+_DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
+_WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
+_CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
+_FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
+_RESIDUAL = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, ARRAY)
+_CORRECT = (ARRAY, ARRAY, INTEGER, REAL, ARRAY)
+_MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
+_TYPES = ("f32", "f64")
+_PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
+
+PROTOTYPES: native.Prototypes = {
+    # coder.cpp
+    "fhash_encode": (
+        ARRAY,
+        ARRAY,
+        REAL,
+        INTEGER,
+        ARRAY,
+        *_SIZED,
+        *_STATE,
+        INTEGER,
+        *_SIZED,
+    ),
+    "fhash_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
+    # fast.cpp
+    "fhash_fast_encode": (
+        ARRAY,
+        ARRAY,
+        INTEGER,
+        REAL,
+        REAL,
+        ARRAY,
+        *_SIZED,
+        ARRAY,
+        ARRAY,
+        *_SIZED,
+        ARRAY,
+    ),
+    "fhash_fast_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, ARRAY, ARRAY, *_SIZED),
+    # mask.cpp
+    "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
+    "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
+    # mask_levels.cpp
+    **{f"fhash_mask_levels_{kind}": _MASK_LEVELS for kind in _TYPES},
+    # labels.cpp
+    "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
+    "fhash_decode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
+    # predict.cpp
+    "fhash_encode_predicted": (*(ARRAY,) * 4, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
+    "fhash_decode_predicted": (*(ARRAY,) * 3, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
+    # lifting.cpp
+    **{f"fhash_transform_forward_{kind}": _TRANSFORM for kind in _TYPES},
+    **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
+    **{f"fhash_reconstruct_{kind}": _RECONSTRUCT for kind in _TYPES},
+    # quantise.cpp
+    **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
+    **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
+    # values.cpp
+    **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
+    **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},
+    **{f"fhash_free_{kind}": _FREE for kind in _TYPES},
+    **{f"fhash_residual_{pair}": _RESIDUAL for pair in _PAIRS},
+    **{f"fhash_correct_{pair}": _CORRECT for pair in _PAIRS},
+}
+"""Kernels that only tests call from Python."""
+
+
+def library() -> ctypes.CDLL:
+    """The native library, with the kernels of PROTOTYPES."""
+    # Another name of the folder: under its own one the library is loaded for the product.
+    folder = Path(native.__file__).parent / ".." / "native"
+    return native.load_library(folder, "_core", native.ABI_VERSION, PROTOTYPES)
+
 
 Buffer = npt.NDArray[np.uint8]
 """Room for the bytes of an encoder."""
@@ -28,18 +109,12 @@ LOW = 0
 """First of four columns: the lowest index of the band along t, z, y, x."""
 HIGH = 4
 """First of four columns: one past the highest index of the band along t, z, y, x."""
-KIND = 8
-"""Column of the kind, 0 to 63; bands of one kind share their statistics."""
 REFERENCES = 9
 """First column of the references: the earlier bands from which a band takes contexts."""
 REFERENCE_COUNT = 4
 """References of a band: its parent, the bands before it along t and along z, and its sibling."""
 REFERENCE_COLUMNS = 5
 """Columns of one reference: BAND, then SHIFT along t, z, y, x."""
-BAND = 0
-"""Column within a reference: number of the band referred to, or -1 for no band."""
-SHIFT = 1
-"""First of four columns within a reference: halvings between the two bands along t, z, y, x."""
 COLUMNS = REFERENCES + REFERENCE_COUNT * REFERENCE_COLUMNS
 """Columns of the table."""
 
@@ -256,7 +331,7 @@ def encode_integers(
         # rows that became empty are signalled differently.
         if chosen is not None:
             np.copyto(integers, given)
-        code: int = native.library().fhash_encode(
+        code: int = library().fhash_encode(
             _pointer(integers),
             _pointer(chosen),
             weight,
@@ -272,6 +347,24 @@ def encode_integers(
         return code
 
     return Encoded(data=with_room(given.size // 2, encode), integers=integers)
+
+
+NEXT = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]])
+"""FORMAT.md, Two quantisers."""
+
+
+def of_two_quantisers(indices: Integers, table: Table) -> Integers:
+    """The integers whose indices these are, in the bands of a table; 0 elsewhere."""
+    result, state = np.zeros_like(indices), 0
+    for row in table:
+        box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
+        band = indices[box]
+        values = np.empty(band.size, np.int32)
+        for at, k in enumerate(band.ravel().tolist()):
+            values[at] = np.sign(k) * (2 * abs(k) - (state & 1))
+            state = NEXT[state, k & 1]
+        result[box] = values.reshape(band.shape)
+    return result
 
 
 def with_room(room: int, encode: Callable[[Buffer], int]) -> bytes:
@@ -306,7 +399,7 @@ def decode_integers(
     where = ((ctypes.c_int64 * 4)(*shape), *array_arguments(table))
     if fast:
         prior = fast_prior()
-        code = native.library().fhash_fast_decode(
+        code = library().fhash_fast_decode(
             _pointer(integers),
             trellis,
             *where,
@@ -315,7 +408,7 @@ def decode_integers(
             *array_arguments(source),
         )
     else:
-        code = native.library().fhash_decode(
+        code = library().fhash_decode(
             _pointer(integers),
             trellis,
             *where,
@@ -402,24 +495,6 @@ def _encode_fast(
     return Encoded(data=with_room(given.size // 2, encode), integers=result)
 
 
-def foretell(
-    coefficients: npt.NDArray[np.float32], table: Table, scale: float, weight: float
-) -> tuple[float, float]:
-    """The bytes that the fast coder would take for coefficients, and the sum of squared errors.
-
-    Args:
-        coefficients: (t, z, y, x).
-        table: the bands.
-        scale: 1 / quantiser step.
-        weight: squared steps that a bit is worth.
-
-    Returns bytes, and the error in squared steps.
-    """
-    nothing = np.empty(0, np.uint8)
-    how = (False, scale, weight)
-    return _fast(None, coefficients, how, coefficients.shape, table, nothing)[1:]
-
-
 def _fast(
     integers: Integers | None,
     values: npt.NDArray[np.float32] | None,
@@ -433,7 +508,7 @@ def _fast(
     how: whether integers are chosen on a trellis, factor of the values, weight of a bit.
     """
     prior, results = fast_prior(), (ctypes.c_double * 2)()
-    size = native.library().fhash_fast_encode(
+    size = library().fhash_fast_encode(
         _pointer(integers),
         _pointer(values),
         *how,
@@ -477,7 +552,7 @@ def encode_labels(labels: npt.NDArray[Any], count: int) -> bytes:
     shape = (ctypes.c_int64 * 4)(*work.shape)
 
     def encode(buffer: Buffer) -> int:
-        code: int = native.library().fhash_encode_labels(
+        code: int = library().fhash_encode_labels(
             work.ctypes.data, count, shape, *array_arguments(buffer)
         )
         return code
@@ -492,7 +567,7 @@ def decode_labels(data: bytes | memoryview, count: int, shape: tuple[int, ...]) 
     """
     labels = np.zeros(shape, dtype=np.uint16)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = native.library().fhash_decode_labels(
+    code = library().fhash_decode_labels(
         labels.ctypes.data, count, (ctypes.c_int64 * 4)(*shape), *array_arguments(source)
     )
     checked(code)
@@ -515,7 +590,7 @@ def mask_levels(mask: MaskLevels, values: npt.NDArray[Any]) -> tuple[Levels, Lev
     source = np.ascontiguousarray(values)
     scores = (ctypes.c_int32 * len(mask.scores))(*mask.scores)
     others = (ctypes.c_int32 * len(mask.others))(*mask.others) if mask.others else None
-    function = getattr(native.library(), f"fhash_mask_levels_f{8 * values.dtype.itemsize}")
+    function = getattr(library(), f"fhash_mask_levels_f{8 * values.dtype.itemsize}")
     code = function(
         source.ctypes.data,
         (ctypes.c_int64 * 4)(*values.shape),
@@ -570,7 +645,7 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels]) -> bytes:
     bits, first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in (mask, *levels))
 
     def encode(buffer: Buffer) -> int:
-        code: int = native.library().fhash_encode_mask(
+        code: int = library().fhash_encode_mask(
             *(array.ctypes.data for array in (bits, first, second)),
             (ctypes.c_int64 * 4)(*mask.shape),
             *state_arguments(mask_prior_state()),
@@ -591,7 +666,7 @@ def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask
     mask = np.empty(shape, dtype=np.uint8)
     first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in levels)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = native.library().fhash_decode_mask(
+    code = library().fhash_decode_mask(
         *(array.ctypes.data for array in (mask, first, second)),
         (ctypes.c_int64 * 4)(*shape),
         *state_arguments(mask_prior_state()),
@@ -651,7 +726,7 @@ def encode_predicted(
 
     def encode(buffer: Buffer) -> int:
         np.copyto(result, integers)
-        code: int = native.library().fhash_encode_predicted(
+        code: int = library().fhash_encode_predicted(
             result.ctypes.data,
             None if marks is None else marks.ctypes.data,
             *_geometry(integers.shape, predictor),
@@ -672,7 +747,7 @@ def decode_predicted(
     """
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = native.library().fhash_decode_predicted(
+    code = library().fhash_decode_predicted(
         integers.ctypes.data,
         *_geometry(shape, predictor),
         *state_arguments(blank_predicted_state()),

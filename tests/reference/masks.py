@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.coder import mask_prior_state
 from reference.adaptive import Adaptive
+from reference.kernels import mask_prior_state
 
 Levels = npt.NDArray[Any]
 

@@ -2,6 +2,41 @@
 
 from __future__ import annotations
 
+import zlib
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.errors import DamagedFileError
+from fhash_formats.support.values import Integers, Mask, Values
+from fhash_formats.transform.spec import MAX_LABELS
+from fhash_formats.transform.tile_format import (
+    EMPTY,
+    FAST,
+    LABELS,
+    MASKED,
+    MISSING,
+    OWN,
+    RESIDUAL,
+    Shape,
+    TileSettings,
+    read_varint,
+    seal,
+    surely_exceeds,
+    varint,
+)
+from reference.kernels import (
+    decode_labels,
+    encode_integers,
+    encode_labels,
+    single_band,
+)
+
+_MARKS = 4
+"""Labels of missing values."""
+_MISSING_VALUES = (np.nan, np.inf, -np.inf)
+"""Values with the labels 1, 2 and 3."""
+
 
 def build_stream(
     kind: int,
@@ -36,23 +71,6 @@ def build_stream(
         sections.append(encode_integers(residual, single_band(residual.shape), fast=fast).data)
     if mask is not None and kind != EMPTY:
         sections.append(mask)
-    return seal(flags, sections)
-
-
-def build_exact_stream(
-    values: Values, settings: TileSettings | None, occupied: Mask | None
-) -> bytes:
-    """The stream of a tile stored without loss.
-
-    Args:
-        values: the tile (t, z, y, x).
-        settings: the tile's own settings; None for none.
-        occupied: the mask; None for a stream without one.
-    """
-    flags, sections = _head(EXACT, settings, occupied is not None)
-    sections.append(pack_planes(values))
-    if occupied is not None:
-        sections.append(pack_mask(occupied, zero_levels(values.shape)))
     return seal(flags, sections)
 
 
@@ -108,27 +126,6 @@ def restore_missing(decoded: Values, missing: bytes | memoryview | None) -> Valu
         for mark, value in enumerate(_MISSING_VALUES, start=1):
             decoded[marks == mark] = value
     return decoded
-
-
-def zero_levels(shape: tuple[int, ...]) -> tuple[Levels, Levels]:
-    """Levels of a mask that no decoded values say anything about."""
-    return np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-
-
-def pack_mask(occupied: Mask, levels: tuple[Levels, Levels]) -> bytes:
-    """The section of a mask; empty where all values are occupied.
-
-    levels: how likely each value is occupied (`MaskLevels.levels`).
-    """
-    if occupied.all():
-        return b""
-    # The decoder reads zeros past the end, so one zero stands for an empty code.
-    return encode_mask(occupied, levels) or b"\0"
-
-
-def unpack_mask(packed: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
-    """The mask in a section."""
-    return decode_mask(packed, levels) if len(packed) else np.ones(levels[0].shape, bool)
 
 
 def labelled_stream(

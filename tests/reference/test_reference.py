@@ -20,13 +20,13 @@ from tiles import predictor_of, random_head
 from fhash_codec import EncodeConfig, FhashError, encode
 from fhash_codec.selftest.run import cases
 from fhash_formats.container.reader import Container
-from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.coder import MaskLevels, encode_block
-from fhash_formats.transform.predict import encode_differences, encode_predicted
+from fhash_formats.transform.predict import encode_differences
+from fhash_formats.transform.spec import MaskLevels, encode_block
 from fhash_formats.transform.stream import ArrayAxes
-from fhash_formats.transform.tile import Coding, decode_tile_mask, encode_tile
+from fhash_formats.transform.tile import Coding, decode_tile_mask, encode_chunk, encode_tile
 from fhash_formats.transform.tile_format import DIFFERENCES, TileSettings, seal
 from reference import predictor as reference_predictor
+from reference.kernels import encode_predicted
 from reference.tile import chunk_of, decode_tile
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Integers, Values
+from fhash_formats.support.values import Integers, Values
 from fhash_formats.transform.spec import AXES, KINDS, AxisTransform, TransformSpec
-from reference.kernels import COLUMNS, NO_REFERENCE, Table
+from reference.kernels import COLUMNS, NO_REFERENCE, Table, library
 
 MAX_EXACT = 512
 """Longest axis, in vertices, whose norms are computed at each position."""
@@ -79,7 +78,7 @@ def _inverse(bands: NDArray[np.float64], kind: str, depth: int) -> NDArray[np.fl
     n, columns = bands.shape
     values, ones = np.empty_like(bands), np.ones(max(n, columns))
     four, pointer = ctypes.c_int64 * 4, ctypes.c_void_p
-    code = native.library().fhash_transform_inverse_f64(
+    code = library().fhash_transform_inverse_f64(
         pointer(bands.ctypes.data),
         pointer(values.ctypes.data),
         four(n, 1, 1, columns),
@@ -139,7 +138,7 @@ class _Plan:
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
         result = np.empty(values.shape, values.dtype)
         _check_code(
-            getattr(native.library(), f"fhash_transform_{direction}_f{width}")(
+            getattr(library(), f"fhash_transform_{direction}_f{width}")(
                 *self._native_arguments(values, result, inverse)
             )
         )
@@ -148,7 +147,7 @@ class _Plan:
     def reconstruct(self, integers: Integers, result: Values, numbers: Sequence[float]) -> None:
         """Write the values of integers into `result`. Raises MemoryError."""
         _check_code(
-            getattr(native.library(), f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
+            getattr(library(), f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
                 *self._native_arguments(integers, result, inverse=True),
                 (ctypes.c_double * len(numbers))(*numbers),
             )

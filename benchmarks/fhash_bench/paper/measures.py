@@ -31,7 +31,7 @@ from fhash_codec.rendering.stream_fields import CoresetField
 from fhash_codec.rendering.stream_march import stream
 from fhash_codec.rendering.torch_arrays import TorchArrays
 from fhash_codec.rendering.transfer_function import TransferFunction
-from fhash_formats.support.arrays import Mask, Single
+from fhash_formats.support.values import Mask, Single
 
 if TYPE_CHECKING:
     from fhash_bench.paper.trained import TrainedEncoding

@@ -26,8 +26,8 @@ from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Lighting, Marched, Table, Task
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import usable_threads
+from fhash_formats.support.values import Single
 
 SIDE = 256
 """Vertices along each axis."""

@@ -29,8 +29,8 @@ from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import GRADIENTS, Scene, Shading, TransferFunctionSpec
 from fhash_codec.volume import Volume
 from fhash_formats.errors import MissingDependencyError
-from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import usable_threads
+from fhash_formats.support.values import Double, Single
 
 Pixels = npt.NDArray[np.uint8]
 

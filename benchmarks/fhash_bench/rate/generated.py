@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fhash_codec.simulation.simulate import Simulation, simulate
 from fhash_formats.errors import InputError, suggestion
 from fhash_formats.series import ArraySeries, Coordinate
-from fhash_formats.support.arrays import Single
+from fhash_formats.support.values import Single
 
 PREFIX = "generated:"
 """Beginning of the name of a generated series where a file could stand."""

@@ -35,7 +35,7 @@ from fhash_codec.cost.peers import (
     stored_bytes,
 )
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import Values
 
 SMALL_CHUNK = 32
 """Vertices along an axis of a chunk, as a user who reads regions would choose."""

@@ -47,7 +47,7 @@ from fhash_codec.cost.peers import (
     stored_bytes,
 )
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import Values
 
 Script = Callable[[str, str], str]
 VALUES = np.random.default_rng(0).normal(size=(3, 4, 5, 6)).astype(np.float32)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fhash_codec.config import ENGINES
 from fhash_codec.devices import need_torch
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Single
+from fhash_formats.support.values import Single
 
 if TYPE_CHECKING:
     from fhash_codec.features.bricks import Coreset

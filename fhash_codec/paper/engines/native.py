@@ -35,8 +35,8 @@ from fhash_codec.paper.engines.parameters import (
 )
 from fhash_codec.paper.network import Architecture, parameter_count
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Double, Longs, Single
 from fhash_formats.support.threads import usable_threads
+from fhash_formats.support.values import Double, Longs, Single
 
 GROUP = 16
 """Vertices along x that are interpolated together; FHASH_GROUP in bricks.hpp."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fhash_codec.features.bricks import Coreset, sample_places
 from fhash_codec.paper.network import Architecture, Resolution
-from fhash_formats.support.arrays import Double, Longs, Single
+from fhash_formats.support.values import Double, Longs, Single
 
 BETA1 = 0.9
 """Decay of the mean of gradients per step."""

@@ -41,7 +41,7 @@ from fhash_codec.paper.engines.parameters import (
     used_numbers,
 )
 from fhash_codec.paper.network import Architecture, parameter_count
-from fhash_formats.support.arrays import Single
+from fhash_formats.support.values import Single
 
 
 class Upsampling:

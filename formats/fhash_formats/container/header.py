@@ -14,8 +14,7 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.zip_file import check_major
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.series import AXIS_NAMES, Coordinate
-from fhash_formats.support.arrays import Double
-from fhash_formats.support.values import DTYPES
+from fhash_formats.support.values import DTYPES, Double
 from fhash_formats.transform.head import MAX_HIDDEN
 from fhash_formats.transform.head import MAX_WIDTH as MAX_HEAD_WIDTH
 

@@ -48,25 +48,6 @@ FLOAT = ctypes.c_float
 Prototypes = Mapping[str, tuple[Any, ...]]
 """Argument types of native functions by name; the result of each is an int64."""
 
-_SIZED = (ARRAY, INTEGER)
-_STATE = _SIZED * 3
-"""Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
-_TRANSFORM = (ARRAY,) * 9
-_RECONSTRUCT = (*_TRANSFORM, ARRAY)
-_HEAD = (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY)
-_QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
-_DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
-_TRELLIS = (*(ARRAY,) * 3, INTEGER, *(ARRAY,) * 3)
-_TRELLIS_COUNT = (*(ARRAY,) * 3, INTEGER, *(ARRAY,) * 2)
-_WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
-_CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
-_FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
-_RESIDUAL = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, ARRAY)
-_CORRECT = (ARRAY, ARRAY, INTEGER, REAL, ARRAY)
-_MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
-_TYPES = ("f32", "f64")
-_PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
-
 _TILE = (ARRAY, ARRAY)
 """Context and tile."""
 _STREAM = (*_TILE, ARRAY, ctypes.c_size_t)
@@ -93,67 +74,9 @@ _RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.
 PROTOTYPES: Prototypes = {
     **_TILES,
     "fhash_encode_block": (*(ARRAY,) * 3, INTEGER),
-    "fhash_decode_block": (*_SIZED, ARRAY, ARRAY),
-    # coder.cpp
-    "fhash_encode": (
-        ARRAY,
-        ARRAY,
-        REAL,
-        INTEGER,
-        ARRAY,
-        *_SIZED,
-        *_STATE,
-        INTEGER,
-        *_SIZED,
-    ),
-    "fhash_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
-    # fast.cpp
-    "fhash_fast_encode": (
-        ARRAY,
-        ARRAY,
-        INTEGER,
-        REAL,
-        REAL,
-        ARRAY,
-        *_SIZED,
-        ARRAY,
-        ARRAY,
-        *_SIZED,
-        ARRAY,
-    ),
-    "fhash_fast_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, ARRAY, ARRAY, *_SIZED),
-    # mask.cpp
-    "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
-    "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
-    # mask_levels.cpp
-    **{f"fhash_mask_levels_{kind}": _MASK_LEVELS for kind in _TYPES},
-    # labels.cpp
-    "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
-    "fhash_decode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
-    # predict.cpp
-    "fhash_encode_predicted": (*(ARRAY,) * 4, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
-    "fhash_decode_predicted": (*(ARRAY,) * 3, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
-    # lifting.cpp
-    **{f"fhash_transform_forward_{kind}": _TRANSFORM for kind in _TYPES},
-    **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
-    **{f"fhash_reconstruct_{kind}": _RECONSTRUCT for kind in _TYPES},
-    # head.cpp
-    "fhash_head_apply": _HEAD,
-    # quantise.cpp
-    **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
-    **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
-    # trellis.cpp
-    "fhash_trellis_count": _TRELLIS_COUNT,
-    **{f"fhash_trellis_guess_{kind}": _TRELLIS_COUNT for kind in _TYPES},
-    **{f"fhash_trellis_choose_{kind}": _TRELLIS for kind in _TYPES},
-    # crc32c.cpp
+    "fhash_decode_block": (ARRAY, INTEGER, ARRAY, ARRAY),
+    "fhash_head_apply": (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY),
     "fhash_crc32c": (ARRAY, INTEGER, INTEGER, INTEGER),
-    # values.cpp
-    **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
-    **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},
-    **{f"fhash_free_{kind}": _FREE for kind in _TYPES},
-    **{f"fhash_residual_{pair}": _RESIDUAL for pair in _PAIRS},
-    **{f"fhash_correct_{pair}": _CORRECT for pair in _PAIRS},
 }
 """Functions of this package's library that Python calls."""
 

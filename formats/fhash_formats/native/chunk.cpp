@@ -558,7 +558,8 @@ int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const 
 
 // Code a tile with the settings of `tile`; without any it is stored without loss.
 //
-// in_coreset: the values that count, or without settings the mask of the stream; null for all. decoded: room for the decoded values, or null.
+// in_coreset: the values that count, or without settings the mask of the stream; null for all.
+// decoded: room for the decoded values, or null.
 // data, size: get the stream, which fhash_tile_free releases. nonzero: coded integers other than 0.
 FHASH_EXPORT int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile,
                                      const void* values, const uint8_t* in_coreset,

@@ -619,6 +619,9 @@ bool encode_tile(fhash_context& context, const std::shared_ptr<const Settings>& 
                  const Shape& shape, int32_t type, const void* values, const uint8_t* in_coreset,
                  const fhash_coding& coding, Coded& coded, fhash_error& error) {
     const Wide& origin = settings->origin;
+    double largest;  // a decoder would refuse the stream
+    if (!check_numbers(*settings, origin.zero() ? type : (int32_t)FHASH_INT64, largest, error))
+        return false;
     Task task = {context, *settings, shape, type, (const uint8_t*)values, coding, {}, {}, {}};
     if (origin.zero()) return encode_about_origin(task, in_coreset, coded, error);
     if (!has_origin(origin, type))

@@ -1,5 +1,5 @@
 // Levels of a mask from decoded values: how likely each vertex is occupied
-// (transform/coder.py says what they mean).
+// (transform/spec.py says what they mean).
 //
 // Scores of values are summed over the vertices within reach along z, then y, then x, and cut after
 // each axis. Each sum is that of the vertex before, plus one value, less one.

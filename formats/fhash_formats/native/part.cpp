@@ -251,6 +251,8 @@ FHASH_EXPORT int32_t fhash_tile_foretold(fhash_context* context, const fhash_til
                                          int64_t* size, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
+            if (!settings->predictor)
+                return fail(failed, FHASH_ERROR_ARGUMENT, "the settings have no predictor");
             std::vector<int32_t> given(integers, integers + vertices(shape));
             Buffer data;
             if (!encode_predicted(*settings->predictor, shape, counted, given, data, failed))

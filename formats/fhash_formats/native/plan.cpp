@@ -275,8 +275,8 @@ double gain_of(int kind, int64_t n, int levels) {
     return gain;
 }
 
-// (S^T S)^-1 S^T of a basis S, (rank, n), which gives the least-squares coefficients of a column; by
-// elimination in a fixed order. False where S is nearly singular.
+// (S^T S)^-1 S^T of a basis S, (rank, n), which gives the least-squares coefficients of a column;
+// by elimination in a fixed order. False where S is nearly singular.
 bool analysis_of(const Basis& basis, std::vector<double>& result) {
     const int64_t n = basis.n, rank = basis.rank;
     const auto vector = [&](int64_t i, int64_t r) {

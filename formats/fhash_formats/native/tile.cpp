@@ -80,7 +80,8 @@ bool read_mask_by(const Job& job, const L* linear, uint8_t* occupied, fhash_erro
     return read_mask(job, first.data(), second.data(), occupied, error);
 }
 
-// Settings that turn finite values into infinities in the working type or that of the source.
+}  // namespace
+
 bool check_numbers(const Settings& settings, int32_t type, double& largest, fhash_error& error) {
     largest = settings.real64 ? DBL_MAX : FLT_MAX;
     const bool floats = type >= FHASH_FLOAT16;
@@ -93,6 +94,8 @@ bool check_numbers(const Settings& settings, int32_t type, double& largest, fhas
                     "the range of a coded tile or its centre is beyond %.6g", largest);
     return true;
 }
+
+namespace {
 
 template <class O>
 bool decode_exact(const Job& job, O* values, uint8_t* occupied, fhash_error& error) {

@@ -37,6 +37,10 @@ bool make_job(Job& job, const fhash_tile* tile, const void* stream, size_t size,
               fhash_error& error);
 bool is_shape(const int64_t* shape);
 
+// Whether settings turn no finite value into an infinity, in the working type or in that of the
+// array; `largest` gets the largest number of both.
+bool check_numbers(const Settings& settings, int32_t type, double& largest, fhash_error& error);
+
 // The values of a job in the type of the array, and which are occupied; `occupied` may be null.
 bool decode(const Job& job, void* values, uint8_t* occupied, fhash_error& error);
 // The same less the origin of the settings, in the type of what is coded.

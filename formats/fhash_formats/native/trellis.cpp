@@ -1,6 +1,6 @@
 // Choice of the integers of dependent quantisation: the path through the trellis
 // (coder_contexts.hpp) of least squared error and bits, by the algorithm of Viterbi. Encoders alone
-// need it. transform/tile.py describes it. All costs are whole numbers.
+// need it. choose.cpp searches by it. All costs are whole numbers.
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>

@@ -471,8 +471,6 @@ int32_t type_of_name(const char* name) {
     return 0;
 }
 
-const char* type_name(int32_t type) { return TYPES[type]; }
-
 const Array* Hierarchy::find(const std::string& path) const {
     const auto found = arrays.find(path);
     return found == arrays.end() ? nullptr : &found->second;

@@ -50,9 +50,8 @@ struct Hierarchy {
     const Array* find(const std::string& path) const;
 };
 
-// The type of a name, 0 for none; bytes of a value.
+// The type of a name; 0 for none.
 int32_t type_of_name(const char* name);
-const char* type_name(int32_t type);
 
 // Checks the version and the required features in the attribute `fhash` of the root
 // (variable.cpp).

@@ -33,8 +33,7 @@ from fhash_formats.readers.variables import (
 )
 from fhash_formats.readers.vtk_document import Document, Element, VtkArrays
 from fhash_formats.series import AXIS_NAMES, Coordinate
-from fhash_formats.support.arrays import Values
-from fhash_formats.support.values import is_number
+from fhash_formats.support.values import Values, is_number
 
 XML_SUFFIXES = (".vti", ".vtr", ".pvti", ".pvtr")
 SPACE = ("z", "y", "x")

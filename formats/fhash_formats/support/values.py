@@ -1,4 +1,4 @@
-"""Values of headers and attributes: number types, plain JSON, typed attributes."""
+"""Types of arrays, and values of headers and attributes: plain JSON, typed attributes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
+
+Values = npt.NDArray[Any]
+"""Numbers of any type."""
+Double = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int32]
+Longs = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
 
 
 def is_number(text: str) -> bool:

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import in_threads, row_parts, usable_threads
+from fhash_formats.support.values import Single
 
 OFFSETS: tuple[tuple[int, int, int, int], ...] = (
     *((offset, 0, 0, 0) for offset in (-1, 1)),

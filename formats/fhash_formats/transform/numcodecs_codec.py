@@ -18,7 +18,8 @@ from numcodecs.abc import Codec
 from numcodecs.compat import ensure_bytes, ndarray_copy
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.chunk import (
+from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.tile import (
     DEFAULT_EFFORT,
     Quality,
     check_effort,
@@ -26,7 +27,6 @@ from fhash_formats.transform.chunk import (
     encode_chunk,
     supported,
 )
-from fhash_formats.transform.spec import TransformSpec
 
 _MAGIC = b"FHC1"
 """First bytes of a coded array."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Integers, Mask, Values
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.values import ZSTD_LEVEL, pieces
 
 CLASSES = 16

@@ -13,16 +13,18 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.support.arrays import Values
-from fhash_formats.support.values import is_wide_integer, is_within
-from fhash_formats.transform.coder import (
+from fhash_formats.support.values import Values, is_wide_integer, is_within
+from fhash_formats.transform.head import NeighbourHead
+from fhash_formats.transform.predict import Predictor, tap_count
+from fhash_formats.transform.spec import (
+    KINDS,
+    AxisTransform,
+    Basis,
     MaskLevels,
+    TransformSpec,
     decode_block,
     encode_block,
 )
-from fhash_formats.transform.head import NeighbourHead
-from fhash_formats.transform.predict import Predictor, tap_count
-from fhash_formats.transform.spec import KINDS, AxisTransform, Basis, TransformSpec
 
 OFFSETS = 6
 """Reconstruction offsets."""
@@ -69,7 +71,7 @@ class TileSettings:
         labels: whether tiles are also tried as labels, without loss. Decoding needs none of it; a
             file that grows goes on as it began.
         trellis: whether coefficients are quantised by two quantisers in turn
-            (encoding.py). Integers are then in steps, of which each quantiser has every
+            (native/trellis.cpp). Integers are then in steps, of which each quantiser has every
             other one.
         origin: integer that is subtracted from the values before anything else, for arrays of
             64-bit integers alone; `center`, `low` and `high` are then those of the differences.
@@ -373,10 +375,6 @@ _ALLOWED = {
 """Flags that a stream of each kind may have."""
 _CHECKSUM = 4
 """Bytes of the checksum."""
-_MARKS = 4
-"""Labels of missing values."""
-_MISSING_VALUES = (np.nan, np.inf, -np.inf)
-"""Values with the labels 1, 2 and 3."""
 
 
 @dataclass(frozen=True, kw_only=True)

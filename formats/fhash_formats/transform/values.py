@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import Values
 
 _INT64 = np.iinfo(np.int64)
 

@@ -27,18 +27,19 @@ import numpy as np
 from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.chunk import (
+from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.stream import KEY, ArrayAxes, settings_of, take_axes
+from fhash_formats.transform.tile import (
     DEFAULT_EFFORT,
     Quality,
     check_effort,
     decode_chunk,
+    decode_tile,
     encode_chunk,
+    encode_tile,
     supported,
     tile_shape,
 )
-from fhash_formats.transform.spec import TransformSpec
-from fhash_formats.transform.stream import KEY, ArrayAxes, settings_of, take_axes
-from fhash_formats.transform.tile import decode_tile, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 
 if TYPE_CHECKING:

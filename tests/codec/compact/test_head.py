@@ -68,9 +68,9 @@ from fhash_codec.compact.transform import (
 )
 from fhash_codec.config import ACCESSES
 from fhash_codec.progress import Parts
-from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.head import CROSS, INPUTS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.tile_format import TileSettings
 
 

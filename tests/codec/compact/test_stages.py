@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from planned import SingleTile, plan_task
+from reference.kernels import encode_predicted
 
 import fhash_codec
 from fhash_codec import EncodeConfig
@@ -62,10 +63,10 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
+from fhash_formats.transform.predict import Predictor, passes_of
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile import OFFSETS, encode_tile, plain_step
 from fhash_formats.transform.tile import Coding as Coding_step
-from fhash_formats.transform.predict import Predictor, encode_predicted, passes_of
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
 
 Field = Callable[..., npt.NDArray[Any]]

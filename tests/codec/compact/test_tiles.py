@@ -57,8 +57,8 @@ from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.container import Container
 from fhash_formats.series import ArraySeries, StepsSeries
-from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (5, 6, 7, 8)

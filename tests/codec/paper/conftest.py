@@ -28,7 +28,7 @@ from fhash_codec.paper.tables import TrainedTable, trained_tables
 from fhash_codec.paper.train import Probe, TrainingProgress, plan_training, train
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
-from fhash_formats.support.arrays import Single
+from fhash_formats.support.values import Single
 
 Points = list[npt.NDArray[np.float64]]
 """Key indices, z, y and x of points, each (n,)."""

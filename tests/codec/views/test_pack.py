@@ -27,7 +27,7 @@ from fhash_codec.views.unpack import ChunkTable
 from fhash_formats.readers.file_series import Request
 from fhash_formats.readers.zarr_coded import open_coded
 from fhash_formats.series import ArraySeries
-from fhash_formats.transform.chunk import decode_chunk
+from fhash_formats.transform.tile import decode_chunk
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Zarr format 3 specification")

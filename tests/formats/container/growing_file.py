@@ -18,7 +18,7 @@ import numpy as np
 from fhash_formats.container import Container
 from fhash_formats.container.array import TRANSFORM
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
-from fhash_formats.transform.chunk import encode_chunk
+from fhash_formats.transform.tile import encode_chunk
 
 TILE = (2, 3, 4, 4)
 FRAME = (3, 4, 6)

@@ -10,10 +10,9 @@ import numpy as np
 
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
-from fhash_formats.transform.coder import MaskLevels
-from fhash_formats.transform.tile import encode_tile
 from fhash_formats.transform.head import Layer, NeighbourHead
-from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.spec import MaskLevels, TransformSpec
+from fhash_formats.transform.tile import encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (4, 3, 4, 6)

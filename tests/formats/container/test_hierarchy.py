@@ -29,7 +29,7 @@ from fhash_formats.container.hierarchy import array_path, free_node, shows_value
 from fhash_formats.container.source_entry import MAX_BYTES, MAX_INLINE, check_source, read_metadata
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.series import Coordinate, SourceMetadata, SourceVariable, index_coordinate
-from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.spec import MaskLevels
 from fhash_formats.transform.tile_format import TileSettings
 
 

@@ -28,8 +28,7 @@ from fhash_formats.native import crc32c
 from fhash_formats.support import threads as parallel
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform import tile as decoding
-from fhash_formats.transform.tile import decode_tile
-from fhash_formats.transform.tile import encode_tile
+from fhash_formats.transform.tile import decode_tile, encode_tile
 
 
 def values_of(dtype, shape):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 import shutil
 from pathlib import Path
 
 import pytest
+from reference import kernels
 
 from fhash_formats import native
 from fhash_formats.errors import MissingDependencyError
@@ -61,13 +63,13 @@ LISTS = re.compile(r"#define (FHASH_\w+) +\\\n((?:.*\\\n)*.*)\n")
 
 def test_the_prototypes_take_as_many_arguments_as_the_sources() -> None:
     exported = re.compile(r"FHASH_EXPORT \S+ (fhash_\w+)\(([^)]*)\)")
-    checked = 0
+    checked, known = 0, {**PROTOTYPES, **kernels.PROTOTYPES}
     for source in SOURCES.glob("*.cpp"):
         text = source.read_text(encoding="utf-8")
         for macro, meaning in LISTS.findall(text):  # lists of arguments with a name
             text = text.replace(f" {macro}", meaning.replace("\\\n", " "))
         for name, arguments in exported.findall(text):
-            if name in PROTOTYPES and not name.startswith("fhash_tile_"):
+            if name in known:
                 checked += 1
                 types = [
                     "*" if "*" in argument else argument.split()[0].removeprefix("std::")
@@ -78,6 +80,8 @@ def test_the_prototypes_take_as_many_arguments_as_the_sources() -> None:
                     native.INTEGER: "int64_t",
                     native.REAL: "double",
                     native.FLOAT: "float",
+                    ctypes.c_int32: "int32_t",
+                    ctypes.c_size_t: "size_t",
                 }
-                assert types == [names[kind] for kind in PROTOTYPES[name]], name
+                assert types == [names[kind] for kind in known[name]], name
     assert checked >= 16

@@ -22,7 +22,7 @@ from fhash_formats.errors import DamagedFileError, FhashWarning, InputError
 from fhash_formats.readers.file_series import Request
 from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.readers.zarr_coded import coded_names, open_coded
-from fhash_formats.transform.chunk import decode_chunk
+from fhash_formats.transform.tile import decode_chunk
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 

@@ -1,4 +1,4 @@
-"""Transforms to try: each once, none that fits no axis, and no deeper than the axes allow."""
+"""Chunks of any type, shape and quality; bases, transforms and axes."""
 
 from __future__ import annotations
 
@@ -16,36 +16,20 @@ from numpy.typing import NDArray
 from tiles import SETTINGS, SHAPE, same, wave
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError, UnsupportedFileError
-from fhash_formats.transform.chunk import candidates, decode_chunk, encode_chunk, tile_shape
-from fhash_formats.transform.coder import MaskLevels
-from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.spec import (
     MAX_DEPTH,
     MAX_EXPONENT,
     MAX_LENGTH,
     AxisTransform,
     Basis,
+    MaskLevels,
     TransformSpec,
     _dct,
     fit_basis,
 )
 from fhash_formats.transform.stream import TILE_AXES, ArrayAxes, TransformCoder, take_axes
+from fhash_formats.transform.tile import Coding, decode_chunk, encode_chunk, encode_tile, tile_shape
 from fhash_formats.transform.tile_format import KIND, LABELS, TRANSFORMED, TileSettings
-
-
-@pytest.mark.parametrize("shape", [(8, 16, 32, 48), (1, 1, 1, 3), (1, 5, 40, 40), (2, 1, 1, 1)])
-def test_each_is_tried_once_and_fits_the_axes(shape: tuple[int, int, int, int]) -> None:
-    specs = candidates(shape)
-    assert len(set(specs)) == len(specs) > 0
-    for spec in specs:
-        for axis, length in zip(spec.axes, shape, strict=True):
-            assert axis.kind == "none" or 1 <= axis.depth < length.bit_length() + 1
-
-
-def test_the_first_axis_is_also_tried_with_haar_and_without() -> None:
-    kinds = [spec.axes[0].kind for spec in candidates((8, 16, 32, 48))]
-    assert kinds == ["9/7", "haar", "none", "haar"]
-
 
 FLOATS = ["f2", "f4", "f8", ">f4"]
 INTEGERS = ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", ">i2"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import zlib
@@ -11,31 +12,35 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from numpy.typing import NDArray
-from reference.masks import mask_levels
-from tiles import of_two_quantisers
-
-from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform import coder
-from fhash_formats.transform import coder as prior
-from fhash_formats.transform.coder import (
+from reference import kernels
+from reference.kernels import (
     MAX_INTEGER,
-    MaskLevels,
     State,
     Table,
-    decode_block,
     decode_integers,
     decode_labels,
     decode_mask,
-    encode_block,
     encode_integers,
     encode_labels,
     encode_mask,
     mask_prior_state,
+    of_two_quantisers,
     single_band,
     unpack_state,
 )
-from fhash_formats.transform.lifting import band_table
-from fhash_formats.transform.spec import WAVELETS, AxisTransform, TransformSpec, fit_basis
+from reference.masks import mask_levels
+from reference.transforms import band_table
+
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.spec import (
+    WAVELETS,
+    AxisTransform,
+    MaskLevels,
+    TransformSpec,
+    decode_block,
+    encode_block,
+    fit_basis,
+)
 
 Integers = NDArray[np.int32]
 Shape = tuple[int, ...]
@@ -203,7 +208,7 @@ def test_a_second_try_with_more_room_gives_the_same(
     results = []
     for room in (16, 1 << 20):
         # What the coder takes as the room of its first try.
-        monkeypatch.setattr(coder, "max", lambda *_, room=room: room, raising=False)
+        monkeypatch.setattr(kernels, "max", lambda *_, room=room: room, raising=False)
         coded = encode_integers(
             nearest(scaled),
             single_band(scaled.shape),
@@ -438,7 +443,7 @@ def test_levels_are_those_of_the_reference(shape: tuple[int, ...], dtype: str, r
         scores = MaskLevels(
             edges=(-1.0, 0.5, 1e300), scores=(0, 3, 900, 4095), others=others, reach=reach
         )
-        found = scores.levels(values)
+        found = kernels.mask_levels(scores, values)
         both = [scores.scores, *([others] if others else [])]
         expected = mask_levels(values, {"edges": scores.edges, "reach": reach, "scores": both})
         for one, other in zip(found, expected, strict=True):
@@ -487,7 +492,7 @@ def test_the_probabilities_do_not_depend_on_the_c_library() -> None:
     near = np.abs(values - np.rint(values))
     near[21] = 1  # even odds are exact
     assert near.min() > 1e-3
-    assert np.array_equal(prior._PROBABILITIES[1:], np.floor(values))
+    assert np.array_equal(kernels._PROBABILITIES[1:], np.floor(values))
 
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the memory limits of Linux")
@@ -495,9 +500,9 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the memor
 SCRIPT = """
 import resource, sys
 import numpy as np
-from fhash_formats.transform import coder, predict
+from reference import kernels
+from reference.kernels import single_band
 from fhash_formats.transform.predict import Predictor, passes_of
-from fhash_formats.transform.coder import single_band
 
 shape = (1, 1, 1 << 12, 1 << 12)  # 16 Mi vertices
 levels, order = (0, 0, 1, 1), (0, 1, 2, 3)
@@ -510,14 +515,14 @@ integers = np.arange(1 << 24, dtype=np.int32).reshape(shape)
 bits = nothing[0].view(bool)
 # Each call, and the MiB of its result (an int32 or a byte for each vertex) and its copies.
 WORK = {
-    "decode_integers": (64, lambda: coder.decode_integers(b"", shape, single_band(shape))),
-    "encode_integers": (8, lambda: coder.encode_integers(integers, single_band(shape))),
-    "decode_mask": (16, lambda: coder.decode_mask(bytes([255]) * 99, nothing)),
-    "encode_mask": (16, lambda: coder.encode_mask(bits, nothing)),
-    "decode_predicted": (64, lambda: predict.decode_predicted(b"", shape, predictor)),
-    "encode_predicted": (80, lambda: predict.encode_predicted(integers, None, predictor)),
+    "decode_integers": (64, lambda: kernels.decode_integers(b"", shape, single_band(shape))),
+    "encode_integers": (8, lambda: kernels.encode_integers(integers, single_band(shape))),
+    "decode_mask": (16, lambda: kernels.decode_mask(bytes([255]) * 99, nothing)),
+    "encode_mask": (16, lambda: kernels.encode_mask(bits, nothing)),
+    "decode_predicted": (64, lambda: kernels.decode_predicted(b"", shape, predictor)),
+    "encode_predicted": (80, lambda: kernels.encode_predicted(integers, None, predictor)),
 }
-coder.prior_state(False), coder.mask_prior_state(), predict.blank_state()
+kernels.prior_state(False), kernels.mask_prior_state(), kernels.blank_predicted_state()
 with open("/proc/self/status") as status:
     used = next(int(line.split()[1]) for line in status if line.startswith("VmData")) << 10
 # The limit leaves room for the result and the coder's state, but not for its notes on each vertex.
@@ -543,6 +548,8 @@ except MemoryError as error:
     ],
 )
 def test_coders_say_where_memory_runs_out(name: str) -> None:
-    done = subprocess.run([sys.executable, "-c", SCRIPT, name], capture_output=True, text=True)
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", SCRIPT, name]
+    done = subprocess.run(command, capture_output=True, text=True, env=paths)
     assert done.returncode == 0, done.stderr
     assert "no memory" in done.stdout

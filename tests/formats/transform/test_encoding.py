@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from reference.elementwise import LARGEST
+from reference.kernels import encode_integers, single_band
+from reference.sections import build_stream
+from reference.transforms import band_table
 from specs import spec_of
 from tiles import (
     SETTINGS,
@@ -22,75 +26,22 @@ from tiles import (
 )
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
-from fhash_formats.transform.coder import (
-    MaskLevels,
-    encode_integers,
-    single_band,
-)
+from fhash_formats.transform.spec import AxisTransform, Basis, MaskLevels, TransformSpec
 from fhash_formats.transform.tile import (
+    DENSITIES,
+    CodedTile,
+    Coding,
     corrected_region,
     decode_tile,
     decode_tile_mask,
-    transform_for,
-    uncorrected,
-)
-from fhash_formats.transform.tile import (
-    BUCKETS,
-    MAX_CHOSEN,
-    RATES,
-    RATIOS,
-    CodedTile,
-    Coding,
-    choose_integers,
-    choose_levels,
-    code_coefficients,
     encode_tile,
     exact_tile,
     filled,
-    rates_of,
+    uncorrected,
 )
-from fhash_formats.transform.lifting import band_table
-from fhash_formats.transform.spec import AxisTransform, Basis, TransformSpec
-from fhash_formats.transform.tile_format import (
-    EMPTY,
-    MASKED,
-    TRANSFORMED,
-    TileSettings,
-    build_stream,
-)
-from fhash_formats.transform.values import LARGEST
+from fhash_formats.transform.tile_format import EMPTY, KIND, MASKED, TRANSFORMED, TileSettings
 
 TRELLIS = replace(SETTINGS, trellis=True, offsets=(17, -10, -5, -3, -2, -1))
-
-
-def coefficients(shape: tuple[int, ...], spread: float, dtype: Any) -> Any:
-    random = np.random.default_rng(7)
-    values = random.laplace(size=shape) * spread * np.exp(random.normal(size=shape))
-    values[:, :, : shape[2] // 2] *= 0.05  # rows of zeros
-    return np.clip(values, -9e8, 9e8).astype(dtype)
-
-
-def test_a_path_errs_less_than_any_of_the_two_quantisers() -> None:
-    scaled = coefficients((4, 8, 16, 16), 50.0, np.float32)
-    levels = choose_levels(scaled, single_band(scaled.shape), 0.0)
-    plain = 2 * np.rint(scaled / 2)
-    # A trellis of eight states gains 1.0 dB of granular error at most; 1.53 dB is the limit.
-    assert np.square(levels - scaled).mean() < 0.85 * np.square(plain - scaled).mean()
-
-
-def test_a_row_of_zeros_stays_zero() -> None:
-    levels = choose_levels(np.zeros((1, 1, 1, 3000), np.float32), single_band((1, 1, 1, 3000)), 0.3)
-    assert not levels.any()
-
-
-def test_rates_fall_with_the_count() -> None:
-    counts = np.zeros((2, BUCKETS, RATES), np.int64)
-    counts[:, 3, 0], counts[:, 3, 1] = 900, 100
-    rates = rates_of(counts, 0.25)
-    assert rates.shape == counts.shape
-    assert rates.dtype == np.int32
-    assert rates[0, 3, 0] < rates[0, 3, 1] < rates[0, 3, 5]
-    assert not rates_of(counts, 0.0).any()
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
@@ -196,6 +147,8 @@ def test_ends_that_float32_rounds_outwards_are_kept_in_float64() -> None:
     assert -0.7 <= decoded.min() <= decoded.max() <= -0.1
 
 
+MAX_CHOSEN = 1 << 22
+"""Magnitude from which on an integer is the nearest one (native/choose.cpp)."""
 PLAIN = replace(
     SETTINGS,
     transform=spec_of(("none",) * 4, (0,) * 4, SHAPE),
@@ -206,6 +159,9 @@ PLAIN = replace(
 )
 
 
+ON_TRELLIS = replace(PLAIN, trellis=True, offsets=(0,) * 6)
+
+
 def edge(shape: tuple[int, ...], peak: float) -> np.ndarray:
     """Values whose one coefficient, in a transform that does nothing, is `peak` steps of PLAIN."""
     values = np.zeros(shape)
@@ -214,10 +170,14 @@ def edge(shape: tuple[int, ...], peak: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("peak", "exact"), [(LARGEST - 1, False), (LARGEST, True)])
-def test_a_tile_is_exact_where_an_integer_does_not_fit(peak: float, exact: bool) -> None:
+@pytest.mark.parametrize("trellis", [False, True])
+def test_a_tile_is_exact_where_an_integer_does_not_fit(
+    peak: float, exact: bool, trellis: bool
+) -> None:
     values = edge(SHAPE, peak)
     values[0, 0, 0, 0] += PLAIN.step / 3  # which is lost unless the tile is exact
-    settings = replace(PLAIN, low=float(values.min()), high=float(values.max()))
+    ends = {"low": float(values.min()), "high": float(values.max())}
+    settings = replace(ON_TRELLIS if trellis else PLAIN, **ends)
     coded = encode_tile(values, settings, Coding())
     assert np.array_equal(coded.decoded, values) == exact
     assert np.abs(coded.decoded - values).max() <= settings.step
@@ -258,14 +218,13 @@ def field(outside: str) -> tuple[Values, npt.NDArray[np.bool_]]:
 
 
 @pytest.mark.parametrize("outside", ["the same", "noise", "far away", "rough"])
-@pytest.mark.parametrize("density", list(RATIOS))
+@pytest.mark.parametrize("density", DENSITIES)
 def test_counted_values_stay_and_the_others_cost_less(outside: str, density: int) -> None:
     values, counted = field(outside)
     result = filled(
         values,
         counted,
         np.ones(FIELD_SHAPE, bool),
-        transform_for(FIELD_SETTINGS, FIELD_SHAPE),
         FIELD_SETTINGS,
         density,
     )
@@ -281,7 +240,7 @@ def test_more_thresholds_find_a_better_filling() -> None:
     values, counted = field("rough")
     sizes = [
         len(encode_tile(values, FIELD_SETTINGS, Coding(density=density), in_coreset=counted).data)
-        for density in RATIOS
+        for density in DENSITIES
     ]
     assert sizes[-1] < sizes[0]
 
@@ -302,20 +261,24 @@ def test_a_level_of_detail_is_the_same_function_of_the_integers() -> None:
     assert np.abs(half - values[:, ::2, ::2, ::2]).max() < 1.0
 
 
-@pytest.mark.parametrize("settings", [SETTINGS, TRELLIS], ids=["plain", "trellis"])
-def test_integers_that_are_too_large_are_refused(settings: TileSettings) -> None:
-    settings = replace(settings, double=True)
-    coefficients = np.zeros(SHAPE)
-    coefficients[0, 0, 0, 0] = settings.step * LARGEST * 1.1
-    assert code_coefficients(coefficients, settings, 0.1, 1) is None
+def test_a_path_errs_less_than_any_of_the_two_quantisers() -> None:
+    random = np.random.default_rng(7)
+    values = random.laplace(size=SHAPE) * 50 * np.exp(random.normal(size=SHAPE))
+    values[:, :, : SHAPE[2] // 2] *= 0.05  # rows of zeros
+    settings = replace(ON_TRELLIS, step=1.0, low=-1e9, high=1e9)
+    found = encode_tile(values, settings).decoded
+    # A trellis of eight states gains 1.0 dB of granular error at most; 1.53 dB is the limit.
+    plain = 2 * np.rint(values / 2)
+    assert np.square(found - values).mean() < 0.85 * np.square(plain - values).mean()
+    assert not encode_tile(np.zeros((1, 1, 1, 3000)), settings, Coding(weight=0.3)).nonzero
 
 
 def test_large_integers_of_the_trellis_are_near() -> None:
-    settings = replace(TRELLIS, double=True, step=1.0)
-    coefficients = np.random.default_rng(3).uniform(-9e8, 9e8, SHAPE)
-    integers = choose_integers(coefficients, settings, 0.27)
-    assert integers is not None
-    assert np.abs(integers - coefficients).max() <= 2
+    values = np.random.default_rng(3).uniform(-9e8, 9e8, SHAPE)
+    settings = replace(ON_TRELLIS, step=1.0, low=-1e9, high=1e9)
+    found = encode_tile(values, settings, Coding(weight=0.27))
+    assert found.data[4] & KIND == TRANSFORMED
+    assert np.abs(found.decoded - values).max() <= 2
 
 
 @pytest.mark.parametrize("name", list(streams()))

@@ -14,11 +14,13 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.elementwise import OFFSET_UNIT, clip_shifted, dequantise
+from reference.kernels import KINDS, Table
+from reference.transforms import MAX_LOD, Transform, band_lengths, band_table
 from specs import MIXES, SHAPES, TYPES, axis_of, mixes_and_depths, noise, spec_of
 from tiles import HIGH, LOW, random_head, random_tile
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.coder import KINDS, Table
 from fhash_formats.transform.head import (
     INPUTS,
     MAX_WEIGHT,
@@ -27,10 +29,8 @@ from fhash_formats.transform.head import (
     best_spread,
     decode_weights,
 )
-from fhash_formats.transform.lifting import MAX_LOD, Transform, band_lengths, band_table
 from fhash_formats.transform.spec import KINDS as TRANSFORMS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.values import OFFSET_UNIT, clip_shifted, dequantise
 
 RANDOM_SHAPES = [
     (1, 1, 1, 1),

@@ -14,26 +14,36 @@ import numpy.typing as npt
 import pytest
 import tiles
 from numcodecs.zstd import compress, decompress
+from reference.kernels import (
+    State,
+    blank_predicted_state,
+    decode_predicted,
+    encode_predicted,
+    state_arguments,
+)
+from reference.sections import (
+    labelled_stream,
+    pack_missing,
+    pack_planes,
+    restore_missing,
+    unpack_labelled,
+    unpack_planes,
+)
 from specs import spec_of
 from tiles import SETTINGS, Four, predictor_of, random_head, resealed, same, streams, wave
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
 from fhash_formats.support.values import DTYPES
-from fhash_formats.transform import predict
-from fhash_formats.transform.coder import MaskLevels, State, state_arguments
-from fhash_formats.transform.tile import decode_tile, decode_tile_mask
-from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.predict import (
     MAX_PREDICTED_INTEGER,
     Predictor,
-    decode_differences,
-    decode_predicted,
     encode_differences,
-    encode_predicted,
     integers_of,
     passes_of,
 )
+from fhash_formats.transform.spec import MaskLevels
+from fhash_formats.transform.tile import Coding, decode_tile, decode_tile_mask, encode_tile
 from fhash_formats.transform.tile_format import (
     DIFFERENCES,
     EMPTY,
@@ -49,15 +59,9 @@ from fhash_formats.transform.tile_format import (
     TRANSFORMED,
     TileSettings,
     has_regions,
-    labelled_stream,
-    pack_missing,
-    pack_planes,
     parse_stream,
     read_varint,
-    restore_missing,
     seal,
-    unpack_labelled,
-    unpack_planes,
     varint,
 )
 
@@ -190,7 +194,7 @@ def test_threads_that_decode_for_the_first_time_at_once() -> None:
     data, coded = encode_predicted(integers, None, predictor)
     with ThreadPoolExecutor(8) as workers:
         for _ in range(20):
-            predict.blank_state.cache_clear()
+            blank_predicted_state.cache_clear()
             for decoded in workers.map(
                 lambda _: decode_predicted(data, coded.shape, predictor), range(16)
             ):
@@ -616,12 +620,16 @@ def rotated_pole(rows: int, columns: int, *, corners: bool) -> npt.NDArray[np.fl
     return np.stack([at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]], axis=-1)
 
 
+def decode_differences(body: bytes, shape: Shape, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    return decode_tile(seal(DIFFERENCES, [body]), shape, dtype)
+
+
 def differences(values: npt.NDArray[Any]) -> bytes:
     """The body of differences, after it was decoded to the same bits."""
     shape = (1,) * (4 - values.ndim) + values.shape
     body = encode_differences(values.reshape(shape))
     assert body is not None
-    decoded = decode_differences(memoryview(body), shape, values.dtype)
+    decoded = decode_differences(body, shape, values.dtype)
     assert decoded.dtype == values.dtype
     assert decoded.shape == shape
     assert decoded.tobytes() == values.tobytes()
@@ -690,19 +698,19 @@ def test_differences_that_no_encoder_writes(case: str) -> None:
     assert plain[0] == 0, "neither holes nor rests"
     plain[place : place + len(wrong)] = wrong
     with pytest.raises(DamagedFileError, match="numbers that no encoder writes"):
-        decode_differences(memoryview(compress(bytes(plain), 1)), (1, 1, 9, 12), values.dtype)
+        decode_differences(compress(bytes(plain), 1), (1, 1, 9, 12), values.dtype)
 
 
 def test_differences_that_are_cut_or_too_many_are_refused() -> None:
     values = rotated_pole(9, 12, corners=False)
-    body, shape = memoryview(differences(values)), (1, 1, 9, 12)
+    body, shape = differences(values), (1, 1, 9, 12)
     for cut in (0, 5, 12, len(body) - 1):
         with pytest.raises(DamagedFileError):
             decode_differences(body[:cut], shape, values.dtype)
     with pytest.raises(DamagedFileError, match="zstd declares"):
         decode_differences(body, (1, 1, 9, 4), values.dtype)
     with pytest.raises(DamagedFileError, match="zstd declares"):
-        decode_differences(memoryview(compress(bytes(1 << 20), 1)), shape, values.dtype)
+        decode_differences(compress(bytes(1 << 20), 1), shape, values.dtype)
 
 
 def test_a_stream_of_differences_has_details_and_no_flags() -> None:

@@ -13,19 +13,7 @@ import numpy.typing as npt
 import pytest
 import xarray
 import zarr
-from specs import spec_of
-from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
-from zarr.codecs.numcodecs import FixedScaleOffset
-
-from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform import values as elementwise
-from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.tile import encode_tile
-from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
-from fhash_formats.transform.tile_format import TileSettings
-from fhash_formats.transform.values import (
-    all_finite,
-    cast,
+from reference.elementwise import (
     clip_shifted,
     clipped,
     corrected,
@@ -35,6 +23,15 @@ from fhash_formats.transform.values import (
     residual_of,
     within,
 )
+from specs import spec_of
+from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
+from zarr.codecs.numcodecs import FixedScaleOffset
+
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
+from fhash_formats.transform.tile import encode_chunk, encode_tile
+from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.values import PIECE, all_finite, cast
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 Values = npt.NDArray[Any]
@@ -203,7 +200,7 @@ def test_empty_arrays() -> None:
 def test_finite() -> None:
     assert all_finite(np.arange(5))
     for bad in (np.nan, np.inf, -np.inf):
-        given = np.zeros(3 * elementwise.PIECE + 5, np.float32)
+        given = np.zeros(3 * PIECE + 5, np.float32)
         assert all_finite(given)
         given[-1] = bad
         assert not all_finite(given)

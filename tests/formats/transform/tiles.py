@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.typing import NDArray
 from specs import spec_of
 
 from fhash_formats.native import crc32c
-from fhash_formats.transform.coder import MaskLevels, Table
-from fhash_formats.transform.tile import Coding, encode_tile, exact_tile
 from fhash_formats.transform.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
 from fhash_formats.transform.predict import Predictor, passes_of
+from fhash_formats.transform.spec import MaskLevels
+from fhash_formats.transform.tile import Coding, encode_tile, exact_tile
 from fhash_formats.transform.tile_format import TileSettings
 
 Values = npt.NDArray[Any]
@@ -83,24 +82,6 @@ def damaged_copies(data: bytes) -> list[bytes]:
         for bit in range(8)
     ]
     return [*(data[:n] for n in range(len(data))), data + b"\0", data + b"\x01a", *flipped]
-
-
-NEXT = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]])
-"""FORMAT.md, Two quantisers."""
-
-
-def of_two_quantisers(indices: NDArray[np.int32], table: Table) -> NDArray[np.int32]:
-    """The integers whose indices these are, in the bands of a table; 0 elsewhere."""
-    result, state = np.zeros_like(indices), 0
-    for row in table:
-        box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
-        band = indices[box]
-        values = np.empty(band.size, np.int32)
-        for at, k in enumerate(band.ravel().tolist()):
-            values[at] = np.sign(k) * (2 * abs(k) - (state & 1))
-            state = NEXT[state, k & 1]
-        result[box] = values.reshape(band.shape)
-    return result
 
 
 Four = tuple[int, int, int, int]

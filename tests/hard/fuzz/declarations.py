@@ -7,7 +7,7 @@ that no longer fits a function does not compile.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 __all__ = ["CALL", "exported", "header"]
@@ -15,29 +15,32 @@ __all__ = ["CALL", "exported", "header"]
 CALL = re.compile(r"\bfhash_\w+")
 """Names of functions in the text of a target."""
 
-_EXPORTED = re.compile(r"FHASH_EXPORT\s+\S+\s+(fhash_\w+)\(([^)]*)\)")
+_EXPORTED = re.compile(r"FHASH_EXPORT\s+(\S+)\s+(fhash_\w+)\(([^)]*)\)")
 _MACRO = re.compile(r"^#define (\w+)(?:\(([^)]*)\))?[ \t]+(\S.*)$", re.MULTILINE)
 
 
 def exported(sources: Iterable[Path]) -> dict[str, str]:
     """Return the parameters of each exported function of some files of C++, by its name."""
-    return {
-        name: " ".join(parameters.split())
-        for path in sources
-        for name, parameters in _EXPORTED.findall(_expanded(path.read_text(encoding="utf-8")))
-    }
+    return {name: parameters for _, name, parameters in _functions(sources)}
 
 
 def header(sources: Iterable[Path]) -> str:
     """Return a header of C++ that declares the exported functions of some files."""
-    lines = []
-    for name, given in exported(sources).items():
-        parameters = re.sub(r"\b(u?int\d+_t)\b", r"std::\1", given.replace("std::", ""))
-        parameters = re.sub(r"\bi64\b", "std::int64_t", parameters)
-        lines.append(f"std::int64_t {name}({parameters});")
-    structures = sorted(set(re.findall(r"\bFhash\w+", "\n".join(lines))))
+    lines = [
+        re.sub(r"\b(u?int\d+_t|size_t)\b", r"std::\1", f"{result} {name}({parameters});")
+        for result, name, parameters in _functions(sources)
+    ]
+    structures = sorted(set(re.findall(r"\bFhash\w+|\bfhash_\w+(?=\*)", "\n".join(lines))))
     body = [*(f"struct {name};" for name in structures), *lines]
     return "\n".join(["#pragma once", "#include <cstdint>", 'extern "C" {', *body, "}", ""])
+
+
+def _functions(sources: Iterable[Path]) -> Iterator[tuple[str, ...]]:
+    """Yield result, name and parameters of each exported function, without namespaces."""
+    for path in sources:
+        for function in _EXPORTED.findall(_expanded(path.read_text(encoding="utf-8"))):
+            plain = (" ".join(part.replace("std::", "").split()) for part in function)
+            yield tuple(re.sub(r"\bi64\b", "int64_t", part) for part in plain)
 
 
 def _expanded(text: str) -> str:

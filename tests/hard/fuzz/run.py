@@ -38,14 +38,19 @@ TARGETS = tuple(
         "targets",
         "target_coding",
         "target_points",
+        "target_tile",
         "target_values",
     )
 )
 SOURCES = (
     *("coder", "fast", "fast_v3", "trellis", "mask", "mask_levels", "predict", "labels"),
-    *("lifting", "head", "quantise", "values", "crc32c"),
+    *("lifting", "head", "quantise", "values", "crc32c", "prior_bytes", "priors", "inflate"),
+    *("settings", "coding", "plan", "differences", "tile", "choose", "encode", "chunk", "part"),
+    "fhash",
 )
 """Files of NATIVE that are always fuzzed."""
+LIBRARIES = ("zlib", "zstd")
+"""Folders of NATIVE / "third_party", in C, which only the address sanitizer watches."""
 CODEC_SOURCES = (*("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head"),)
 """Files of CODEC that are always fuzzed."""
 NETWORK_SOURCES = ("peak", "points")
@@ -118,16 +123,21 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
         ]
         jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}", declared))]
     jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing)) for name in SOURCES]
+    jobs += [
+        (path, ("-xc", "-std=gnu11", "-w", "-DZSTD_DISABLE_ASM=1", "-fsanitize=address", "-g"))
+        for name in (LIBRARIES if SOURCES else ())
+        for path in (NATIVE / "third_party" / name).rglob("*.c")
+    ]
     jobs += [(CODEC / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in CODEC_SOURCES]
     jobs += [(NETWORK / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in NETWORK_SOURCES]
     jobs += [
-        (target, (*SANITIZE, declared, *(["-DFHASH_FUZZ_MARCH"] if march else [])))
+        (target, (*SANITIZE, declared, headers, *(["-DFHASH_FUZZ_MARCH"] if march else [])))
         for target in TARGETS
     ]
 
     def compiled(job: tuple[Path, tuple[str, ...]]) -> Path:
         source, flags = job
-        result = folder / f"{source.stem}.o"
+        result = folder / f"{source.parent.name}-{source.stem}.o"
         _compile(
             [*compiler.split(), optimise, *FLAGS, *flags, "-c", str(source), "-o", str(result)]
         )
@@ -183,11 +193,12 @@ def prepare(folder: Path, every: int = 1, only: str | None = None) -> dict[str, 
     With `every`, only every so many of the seeds of each kind are written, with `only` those of one
     target.
     """
-    sys.path.insert(0, str(HERE))
+    sys.path[:0] = found = [str(HERE), str(HERE.parents[1])]
     try:
         import seeds
     finally:
-        sys.path.remove(str(HERE))
+        for place in found:
+            sys.path.remove(place)
     folder.mkdir(parents=True, exist_ok=True)
     seeds.write_seeds(folder / "corpus", *seeds.write_setups(folder / "setups"), every, only)
     chosen = {} if only is None else {"FHASH_FUZZ_TARGET": str(seeds.NAMES.index(only))}

@@ -14,28 +14,25 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-from fhash_formats.container import Container
-from fhash_formats.container.array import TRANSFORM
-from fhash_formats.transform.coder import (
+from reference.kernels import (
     Table,
+    blank_state,
     encode_integers,
     encode_labels,
     encode_mask,
+    encode_predicted,
     fast_prior,
     mask_prior_state,
+    of_two_quantisers,
+    pass_arrays,
     prior_state,
     single_band,
 )
-from fhash_formats.transform.tile import choose_levels
-from fhash_formats.transform.lifting import band_table
-from fhash_formats.transform.predict import (
-    Predictor,
-    blank_state,
-    encode_predicted,
-    pass_arrays,
-    passes_of,
-)
+from reference.transforms import band_table
+
+from fhash_formats.container import Container
+from fhash_formats.container.array import TRANSFORM
+from fhash_formats.transform.predict import Predictor, passes_of
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TRANSFORMED, TileSettings, parse_stream
 
@@ -56,10 +53,11 @@ NAMES = (
     "slopes",
     "samples",
     "points",
+    "tile",
     "march",
 )
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
-CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
+CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_, TILE, _ = range(len(NAMES))
 PLAIN, TRELLIS, FAST, FAST_TRELLIS = range(4)
 """Ways to code integers, as inputs of the coder name them."""
 WITH_SEEDS = (CODER, PREDICTOR)
@@ -165,7 +163,7 @@ def write_seeds(
         for scale in (0.5, 30.0, 1e8):
             integers = (rng.laplace(0, scale, shape)).astype(np.int32)
             scaled = (rng.laplace(0, scale, shape)).clip(-9e8, 9e8)
-            path = choose_levels(scaled, table, 0.1)
+            path = of_two_quantisers(integers.clip(-(1 << 28), 1 << 28), table)
             for how, coded in ((PLAIN, integers), (TRELLIS, path), (FAST, integers)):
                 trellis, fast = how == TRELLIS, how == FAST
                 data = encode_integers(coded, table, trellis=trellis, fast=fast).data
@@ -193,6 +191,12 @@ def write_seeds(
             setup = setup_of_bands.get((shape, table.tobytes()))
             if setup is not None:
                 put(CODER, struct.pack("<HB", setup, how), data)
+        # Decoded in all ways, with settings beside the stream.
+        for how in (0, 2, 9, 7):
+            packed = settings.to_bytes()
+            if len(packed) < 4096 and max(shape) <= 64:
+                of = bytes([how, *(n - 1 for n in shape), 9])
+                put(TILE, of, struct.pack("<H", len(packed)), packed, stream)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
         nothing = (np.zeros(shape, np.uint8),) * 2
         for density in (0.02, 0.5):

@@ -32,7 +32,7 @@ from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, time_nodes
 from fhash_codec.paper.network import Architecture, Network, Resolution
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.support.arrays import Single
+from fhash_formats.support.values import Single
 
 TRIAL_BRICKS = 4
 """Bricks of the trial of newly compiled kernels."""

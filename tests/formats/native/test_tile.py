@@ -1,0 +1,298 @@
+"""Tiles by the C interface of fhash.h, called as C calls it: statuses, types, threads, damage."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from reference.tile import decode_tile
+
+from fhash_formats import native
+from fhash_formats.native import crc32c
+from fhash_formats.transform.spec import AxisTransform, MaskLevels, TransformSpec
+from fhash_formats.transform.tile import Coding, encode_tile
+from fhash_formats.transform.tile_format import TileSettings
+
+FOLDER = Path(native.__file__).parent
+HEADER = (FOLDER / "fhash.h").read_text(encoding="utf-8")
+STATUS = {name: int(n) for name, n in re.findall(r"FHASH_(\w+) = (-?\d+)", HEADER)}
+TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+SHAPE = (2, 3, 5, 9)
+Values = npt.NDArray[Any]
+
+
+class Error(ctypes.Structure):
+    _fields_ = (("status", ctypes.c_int32), ("text", ctypes.c_char * 500))
+
+
+class Tile(ctypes.Structure):
+    _fields_ = (
+        ("shape", ctypes.c_int64 * 4),
+        ("type", ctypes.c_int32),
+        ("reserved", ctypes.c_int32),
+        ("settings", ctypes.c_char_p),
+        ("settings_size", ctypes.c_size_t),
+    )
+
+
+class Quality(ctypes.Structure):
+    _fields_ = (
+        ("max_error", ctypes.c_double),
+        ("max_error_rel", ctypes.c_double),
+        ("step", ctypes.c_double),
+        ("effort", ctypes.c_int32),
+        ("transform_given", ctypes.c_int32),
+        ("transform", ctypes.c_uint8 * 4),
+        ("reserved", ctypes.c_int32),
+    )
+
+
+LIBRARY = ctypes.CDLL(str(FOLDER / "_core.so"))
+POINTER, SIZE, INT = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int32
+for _name, _result, *_arguments in (
+    ("fhash_version", INT),
+    ("fhash_type_size", SIZE, INT),
+    ("fhash_context_create", POINTER, ctypes.c_uint64, INT),
+    ("fhash_context_destroy", None, POINTER),
+    ("fhash_tile_bound", SIZE, POINTER),
+    ("fhash_tile_decode", INT, *(POINTER,) * 3, SIZE, INT, *(POINTER,) * 3),
+    ("fhash_tile_encode", INT, *(POINTER,) * 6, SIZE, *(POINTER,) * 2),
+):
+    _function = getattr(LIBRARY, _name)
+    _function.restype, _function.argtypes = _result, _arguments
+
+
+@pytest.fixture
+def context() -> Iterator[int]:
+    made = LIBRARY.fhash_context_create(0, 1)
+    yield made
+    LIBRARY.fhash_context_destroy(made)
+
+
+def tile_of(shape: tuple[int, ...], dtype: Any, settings: bytes | None = None) -> Tile:
+    kind = TYPES.index(np.dtype(dtype).str[1:]) + 1
+    return Tile((ctypes.c_int64 * 4)(*shape), kind, 0, settings, len(settings or b""))
+
+
+def encode(context: int | None, values: Values, room: int = 1 << 16, **given: Any) -> Any:
+    """Status, text, size and bytes of a stream; given: fields of the quality, `fill`, `tile`."""
+    tile, fill = given.pop("tile", tile_of(values.shape, values.dtype)), given.pop("fill", None)
+    quality = Quality(**{"max_error": -1.0, "effort": 2, **given})
+    error, size, stream = Error(), SIZE(), ctypes.create_string_buffer(max(room, 1))
+    status = LIBRARY.fhash_tile_encode(
+        context,
+        ctypes.byref(tile),
+        values.ctypes.data,
+        ctypes.byref(quality),
+        None if fill is None else fill.ctypes.data,
+        stream,
+        room,
+        ctypes.byref(size),
+        ctypes.byref(error),
+    )
+    assert error.status == status
+    assert bool(error.text) == (status != 0)
+    return status, error.text.decode(), size.value, stream.raw[: size.value if not status else 0]
+
+
+def decode(context: int | None, data: bytes, tile: Tile, lod: int = 0, mask: bool = False) -> Any:
+    """Status, values and mask of a stream; the values are followed by bytes that stay."""
+    shape = (tile.shape[0], *(-(-n // (1 << max(lod, 0))) for n in tile.shape[1:]))
+    dtype = np.dtype(TYPES[(tile.type - 1) % 11])
+    room = np.full(int(np.prod(np.maximum(shape, 1))) * dtype.itemsize + 16, 77, np.uint8)
+    seen = np.full(int(np.prod(np.maximum(shape, 1))) + 16, 77, np.uint8) if mask else None
+    status = LIBRARY.fhash_tile_decode(
+        context,
+        ctypes.byref(tile),
+        data,
+        len(data),
+        lod,
+        room.ctypes.data,
+        None if seen is None else seen.ctypes.data,
+        None,
+    )
+    assert (room[-16:] == 77).all()
+    assert seen is None or (seen[-16:] == 77).all()
+    if status:
+        return status, None, None
+    found = room[:-16].view(dtype).reshape(shape)
+    return status, found, None if seen is None else seen[:-16].reshape(shape).view(bool)
+
+
+def field(dtype: Any, shape: tuple[int, ...] = SHAPE) -> Values:
+    t, z, y, x = np.indices(shape)
+    noise = np.random.default_rng(5).normal(0, 0.1, shape)
+    return ((np.sin(0.4 * x + 0.2 * t) + np.cos(0.3 * y - z) + 2 + noise) * 25).astype(dtype)
+
+
+def settings_of(values: Values, **changes: Any) -> TileSettings:
+    nine = AxisTransform(kind="9/7", depth=1)
+    return TileSettings(
+        transform=TransformSpec(axes=(AxisTransform(kind="haar", depth=1), nine, nine, nine)),
+        step=2.0,
+        center=50.0,
+        low=float(values.min()),
+        high=float(values.max()),
+        **changes,
+    )
+
+
+def test_version_and_types() -> None:
+    major, minor = (int(n) for n in re.findall(r"FHASH_VERSION_M\w+ (\d+)", HEADER))
+    assert LIBRARY.fhash_version() == 1000 * major + minor
+    sizes = [LIBRARY.fhash_type_size(n) for n in range(-1, 13)]
+    assert sizes == [0, 0, *(np.dtype(kind).itemsize for kind in TYPES), 0]
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_every_type_comes_back_as_the_reference_reads_it(dtype: str) -> None:
+    """Two threads and one give the same bytes and bits."""
+    made = [LIBRARY.fhash_context_create(0, threads) for threads in (1, 2)]
+    values, tile = field(dtype), tile_of(SHAPE, dtype)
+    for quality, error in (({"max_error": 0.0}, 0), ({"max_error": 3.0}, 3), ({"step": 4.0}, 16)):
+        both = [encode(each, values, **quality) for each in made]
+        assert both[0] == both[1]
+        status, _, size, data = both[0]
+        assert status == 0
+        assert size <= LIBRARY.fhash_tile_bound(ctypes.byref(tile))
+        expected = decode_tile(data, SHAPE, np.dtype(dtype))[0].tobytes()
+        for each in made:
+            found, mask = decode(each, data, tile, mask=True)[1:]
+            assert found.tobytes() == expected
+            assert np.abs(found.astype(float) - values.astype(float)).max() <= error
+            assert mask.all()
+        for lod in (1, 2, 10):
+            coarse = [decode(each, data, tile, lod)[1] for each in made]
+            assert coarse[0].tobytes() == coarse[1].tobytes()
+            if error == 0 and data[4] & 7 != 0:
+                every = 1 << lod
+                assert np.array_equal(coarse[0], values[:, ::every, ::every, ::every])
+    for each in made:
+        LIBRARY.fhash_context_destroy(each)
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "i2", "u8"])
+def test_masks_and_settings_beside_the_stream(dtype: str, context: int) -> None:
+    values = field(dtype)
+    settings = settings_of(values, mask=MaskLevels(edges=(60.0,), scores=(0, 90), reach=1))
+    occupied = values > values.mean()
+    data = encode_tile(values, settings, Coding(weight=0.1), in_coreset=occupied).data
+    block = settings.to_bytes()
+    _, found, mask = decode(context, data, tile_of(SHAPE, dtype, block), mask=True)
+    theirs, their_mask = decode_tile(data, SHAPE, np.dtype(dtype), block)
+    assert np.array_equal(mask, occupied)
+    assert np.array_equal(mask, their_mask)
+    assert found.tobytes() == theirs.tobytes()
+    assert decode(context, data, tile_of(SHAPE, dtype, block))[1].tobytes() == theirs.tobytes()
+    assert decode(context, data, tile_of(SHAPE, dtype))[0] == STATUS["ERROR_DAMAGED"]
+
+
+def test_a_fill_value_takes_no_part_in_the_range(context: int) -> None:
+    values, fill = field("f4"), np.float32([-1e6])
+    values[:, :, 2] = fill[0]
+    data = encode(context, values, max_error_rel=0.01, fill=fill)[3]
+    found, kept = decode(context, data, tile_of(SHAPE, "f4"))[1], values != fill[0]
+    assert np.abs(found - values)[kept].max() <= 0.01 * np.ptp(values[kept])
+    assert len(encode(context, values, max_error_rel=0.01)[3]) < len(data)
+
+
+def test_arguments_that_are_not_allowed(context: int) -> None:
+    values, wrong = field("f4"), STATUS["ERROR_ARGUMENT"]
+    shapes = ((0, 1, 1, 1), (1, 1, -1, 1), (1, 1 << 14, 1 << 14, 1))
+    bad = [tile_of(shape, "f4") for shape in shapes]
+    bad += [Tile(bad[0].shape, kind) for kind in (0, 12, -1)]
+    shared = tile_of(SHAPE, "f4", settings_of(values).to_bytes())
+    for tile in (*bad, shared):
+        assert encode(context, values, max_error=1.0, tile=tile)[0] == wrong
+    qualities: tuple[dict[str, Any], ...] = (
+        {},
+        {"max_error": 1.0, "step": 1.0},
+        {"max_error": np.nan},
+        {"step": np.inf},
+        {"step": -1.0},
+        {"max_error": 1.0, "effort": 0},
+        {"max_error": 1.0, "effort": 10},
+        {"max_error": 1.0, "transform_given": 1, "transform": (ctypes.c_uint8 * 4)(0, 0, 64, 0)},
+        {"max_error": 1.0, "transform_given": 1, "transform": (ctypes.c_uint8 * 4)(0, 0, 59, 0)},
+    )
+    for quality in qualities:
+        assert encode(context, values, **quality)[0] == wrong
+    assert encode(None, values, max_error=1.0)[0] == wrong
+    data, tile = encode(context, values, max_error=1.0)[3], tile_of(SHAPE, "f4")
+    assert decode(None, data, tile)[0] == wrong
+    assert [decode(context, data, tile, lod)[0] for lod in (-1, 11)] == [wrong, wrong]
+    assert decode(context, data, tile, 1, mask=True)[0] == wrong
+    for each in bad[:2]:
+        assert decode(context, data, each)[0] == wrong
+    some, call = ctypes.create_string_buffer(1 << 12), LIBRARY.fhash_tile_decode
+    for of, stream, room in ((None, data, some), (tile, None, some), (tile, data, None)):
+        given = None if of is None else ctypes.byref(of)
+        assert call(context, given, stream, len(data), 0, room, None, None) == wrong
+    assert LIBRARY.fhash_tile_bound(None) == 0
+
+
+def test_room_that_is_too_small_is_told_with_the_size(context: int) -> None:
+    values = field("f4")
+    _, _, size, data = encode(context, values, max_error=0.1)
+    for room in (0, size - 1):
+        status, text, needed, _ = encode(context, values, room, max_error=0.1)
+        assert (status, needed) == (STATUS["ERROR_SIZE"], size)
+        assert str(size) in text
+    assert encode(context, values, size, max_error=0.1)[3] == data
+
+
+def test_memory_is_limited_by_the_context() -> None:
+    narrow, values = LIBRARY.fhash_context_create(1000, 1), field("f4")
+    wide = LIBRARY.fhash_context_create(1 << 26, 1)
+    data = encode(wide, values, max_error=0.1)[3]
+    assert encode(narrow, values, max_error=0.1)[0] == STATUS["ERROR_MEMORY"]
+    assert decode(narrow, data, tile_of(SHAPE, "f4"))[0] == STATUS["ERROR_MEMORY"]
+    assert decode(wide, data, tile_of(SHAPE, "f4"))[0] == 0
+    for each in (narrow, wide):
+        LIBRARY.fhash_context_destroy(each)
+
+
+def test_damage_is_told_or_gives_some_values(context: int) -> None:
+    """Cut and flipped streams, under the checksum that they have and under the right one."""
+    random, damaged = np.random.default_rng(0), STATUS["ERROR_DAMAGED"]
+    qualities = {"f4": {"max_error": 0.1}, "i2": {"max_error": 0.0}, "f8": {"step": 9.0}}
+    for dtype, quality in qualities.items():
+        data, tile = encode(context, field(dtype), **quality)[3], tile_of(SHAPE, dtype)
+        assert all(decode(context, data[:cut], tile)[0] == damaged for cut in range(len(data)))
+        for turn in range(200):
+            other = bytearray(data)
+            for _ in range(1 + turn % 3):
+                other[random.integers(len(other))] ^= 1 << random.integers(8)
+            if other == data:
+                continue
+            assert decode(context, bytes(other), tile)[0] == damaged
+            body = bytes(other[4 : random.integers(5, len(other) + 1)])
+            stream = crc32c(body).to_bytes(4, "little") + body
+            assert decode(context, stream, tile, turn % 2)[0] in (0, damaged)
+
+
+def test_two_threads_share_a_context(context: int) -> None:
+    """Settings and norms are made once, by whoever comes first."""
+    several = [field(dtype, (1, 2, n, 12)) for n in (5, 8, 17) for dtype in ("f4", "f8", "i4")]
+    alone = [encode(context, values, max_error=0.5)[3] for values in several]
+    fresh = LIBRARY.fhash_context_create(0, 2)
+
+    def there_and_back(number: int) -> tuple[bytes, bytes]:
+        values = several[number % len(several)]
+        data = encode(fresh, values, max_error=0.5)[3]
+        return data, decode(fresh, data, tile_of(values.shape, values.dtype))[1].tobytes()
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(there_and_back, range(2 * len(several))))
+    LIBRARY.fhash_context_destroy(fresh)
+    for (data, bits), values, one in zip(found, several * 2, alone * 2, strict=True):
+        assert data == one
+        expected = decode(context, one, tile_of(values.shape, values.dtype))[1]
+        assert bits == expected.tobytes()
