@@ -10,7 +10,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -20,9 +20,6 @@ from fhash_codec.rendering.colours import named_map
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, MissingDependencyError, MissingInputError, OutputError
 from fhash_formats.support.files import check_output, replacing_all
-
-if TYPE_CHECKING:
-    from fhash_codec.volume import Volume
 
 FOLDER = Path(__file__).with_name("page")
 """Files of the page, of which those in KINDS are given."""
@@ -225,8 +222,8 @@ def widget(path: str | Path, height: int) -> Any:
     return type("View", (anywidget.AnyWidget,), {"_esm": WIDGET, **traits})()
 
 
-def html_of(volume: Volume) -> str:
-    """A table about a volume and a picture of its middle slice, for notebooks.
+def html_of(volume: Any) -> str:
+    """A table about an open `Volume` and a picture of its middle slice, for notebooks.
 
     The slice is of a coarse level of detail, so that little is decoded.
     """
@@ -256,7 +253,7 @@ def html_of(volume: Volume) -> str:
     )
 
 
-def _slice(volume: Volume) -> bytes:
+def _slice(volume: Any) -> bytes:
     """A PNG of the slice through the middle of z, or of the first axis of one vertex, at step 0."""
     from PIL import Image
 

@@ -13,10 +13,10 @@ import { Slices } from "./slices.js";
 import { timeText } from "./times.js";
 
 const COARSE = 2 ** 16;
-const MOST_VERTICES = 2 ** 27;
+const MOST_VERTICES = 2 ** 26;
 const BINS = 512;
 const COUNTED = 2 ** 18;
-const MOST_COUNTED = 64 * 2 ** 20;
+const MOST_COUNTED = 16 * 2 ** 20; // bytes of files of which more is read than what is shown
 const MOST_PIXELS = 2 ** 22;
 const BAND_MS = 40;
 
@@ -125,7 +125,8 @@ function levels() {
   while (fine < most && (count(fine) > MOST_VERTICES || Math.max(...sides) / 2 ** fine > largest)) fine++;
   let coarse = fine;
   while (coarse < most && count(coarse) > COARSE) coarse++;
-  return { fine: Math.max(app.scene.march?.lod ?? fine, fine), coarse };
+  fine = Math.min(Math.max(app.scene.march?.lod ?? fine, fine), Math.max(most, fine));
+  return { fine, coarse: Math.max(coarse, fine) };
 }
 
 /** Count the values of the first, middle and last step, as `fhash render` does where it chooses the opacity. */

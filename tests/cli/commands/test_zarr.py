@@ -1,4 +1,4 @@
-"""`fhash pack`, `unpack`, `export` and `serve`."""
+"""`fhash pack`, `unpack`, `export`, `serve` and `view`."""
 
 from __future__ import annotations
 
@@ -151,6 +151,29 @@ def test_the_server_answers_until_it_is_stopped(run: Path, number: int) -> None:
         process.send_signal(number)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out, err) == (0, "", "fhash: stopped\n")
+
+
+def test_the_page_is_served_until_it_is_stopped(run: Path) -> None:
+    words = [*MAIN[:-1], "view", str(run), "--port", "0", "--no-browser", "--json"]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        told = json.loads(process.stdout.readline())
+        assert told["files"] == [run.name]
+        assert opened(told["url"] + run.name) == run.read_bytes()
+        assert b"fhash view" in opened(told["url"])
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "", "fhash: stopped\n")
+
+
+def test_what_cannot_be_viewed_is_told_in_one_line(refused: Refused, tmp_path: Path) -> None:
+    other = tmp_path / "other.fhz"
+    other.write_bytes(b"no container")
+    refused(4, "view", other)
+    refused(2, "view", tmp_path / "none.fhz")
+    refused(2, "view", "https://example.org/run.fhz")
 
 
 def test_the_text_says_how_to_open_it(

@@ -20,6 +20,8 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -241,6 +243,7 @@ def serving(page: Page) -> Iterator[str]:
 def figures(**found: Any) -> None:
     """Keep figures of the long version."""
     if LONG:
+        Path(LONG).mkdir(parents=True, exist_ok=True)
         with Path(LONG, "figures.jsonl").open("a") as file:
             file.write(json.dumps(found) + "\n")
 
@@ -320,16 +323,8 @@ def read_natively(
     header = list(headers.values() if isinstance(headers, dict) else headers)[number]
     shape = [-(-n // 2**lod) for n in header["domain"]["shape"][1:]]
     values = np.empty(shape)
-    read.argtypes = [
-        ctypes.c_void_p,
-        ctypes.c_int32,
-        ctypes.c_double,
-        ctypes.c_void_p,
-        ctypes.c_int32,
-        ctypes.c_int32,
-        ctypes.c_void_p,
-        ctypes.c_void_p,
-    ]
+    room, whole = ctypes.c_void_p, ctypes.c_int32
+    read.argtypes = [room, whole, ctypes.c_double, room, whole, whole, room, room]
     assert not read(file, number, step, None, lod, 11, values.ctypes.data, error), error.raw[4:]
     library.fhash_close.argtypes = library.fhash_context_destroy.argtypes = [ctypes.c_void_p]
     library.fhash_close(file)
@@ -584,6 +579,55 @@ def test_scenes_go_in_and_out(tab: Tab, steady: Path, tmp_path: Path) -> None:
         assert tab.complaints() == []
 
 
+class Plain(SimpleHTTPRequestHandler):
+    """A server that knows no ranges."""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing."""
+
+
+@in_chromium
+def test_servers_without_ranges_and_dropped_files(tab: Tab, steady: Path, tmp_path: Path) -> None:
+    Page([steady]).write(tmp_path / "site")
+    with ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Plain, directory=tmp_path / "site")
+    ) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            tab.go(f"http://127.0.0.1:{server.server_port}/")
+            tab.drawn()
+            assert tab.run("fhash.app.container.loaded") == steady.stat().st_size
+            before = tab.run("fhash.picture().toDataURL()")
+            tab.run(
+                "(async () => { const { drop } = await import('./app.js');"
+                "const bytes = await (await fetch('steady.fhz')).arrayBuffer();"
+                "await drop(new File([bytes], 'dropped.fhz')); })()"
+            )
+            tab.drawn()
+            assert tab.run("document.getElementById('title').textContent") == "dropped.fhz"
+            assert tab.run("fhash.app.container.requests") == 0
+            assert tab.run("fhash.picture().toDataURL()") == before
+            assert tab.complaints() == []
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@in_chromium
+def test_features_are_layers(tab: Tab, feature: Path) -> None:
+    with serving(Page([feature])) as url:
+        tab.go(url)
+        tab.drawn()
+        ends = "[fhash.app.tf.points[0][0], fhash.app.tf.shown[0]]"
+        assert tab.run(ends) == pytest.approx([0.6, 0.6])
+        tab.run("document.querySelector('#features input').click()")
+        tab.drawn()
+        assert tab.run("fhash.app.features.length") == 0
+        assert tab.run(ends)[1] < 0.6
+        assert tab.complaints() == []
+
+
 @in_chromium
 def test_slices_need_no_webgl(tab: Tab, feature: Path) -> None:
     with serving(Page([feature])) as url, fhash_codec.open(feature) as volume:
@@ -688,9 +732,8 @@ def test_real_and_large_files(tab: Tab, tmp_path: Path) -> None:
             tab.go(url, 1400, 900)
             begin = time.monotonic()
             tab.until("fhash.app.frame")
-            shown = time.monotonic() - begin
+            shown, first = time.monotonic() - begin, (page.requests, page.bytes)
             tab.drawn()
-            first = page.requests, page.bytes
             tab.shot(f"{name}-1400")
             for n in range(6):
                 tab.drag((400 + 20 * n, 400), (480 + 20 * n, 420))
