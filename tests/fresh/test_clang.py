@@ -66,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f" -resource-dir {Path(str(package.origin)).parent / 'lib'}"
     )
     command = [sys.executable, "-c", BUILD, "-q", "build_ext", "-b", target, "-t", target / "o"]
-    compiler = {"CC": clang, "CXX": clang, "LDSHARED": f"{clang} -shared"}
+    compiler = {"CC": clang.replace("g++", "gcc"), "CXX": clang, "LDSHARED": f"{clang} -shared"}
     compiler["LDCXXSHARED"] = compiler["LDSHARED"]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, **compiler}, capture_output=True, text=True

@@ -97,7 +97,7 @@ def library() -> ctypes.CDLL:
     """The native library, with the kernels of PROTOTYPES."""
     # Another name of the folder: under its own one the library is loaded for the product.
     folder = Path(native.__file__).parent / ".." / "native"
-    return native.load_library(folder, "_core", native.ABI_VERSION, PROTOTYPES)
+    return native.load_library(folder, "libfhash", native.ABI_VERSION, PROTOTYPES)
 
 
 Buffer = npt.NDArray[np.uint8]

@@ -118,7 +118,7 @@ State even_masks() {
     return state;
 }
 
-constexpr int CHOICES = 64, TOKENS = 16, CONTEXTS = 1744, UNIT = 2048;
+constexpr int CHOICES = 64, TOKENS = 16, UNIT = 2048;
 
 FastPrior make_fast() {
     size_t size;

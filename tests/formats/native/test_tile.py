@@ -54,7 +54,7 @@ class Quality(ctypes.Structure):
     )
 
 
-LIBRARY = ctypes.CDLL(str(FOLDER / "_core.so"))
+LIBRARY = ctypes.CDLL(str(FOLDER / "libfhash.so"))
 POINTER, SIZE, INT = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int32
 for _name, _result, *_arguments in (
     ("fhash_version", INT),

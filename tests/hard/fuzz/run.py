@@ -37,6 +37,7 @@ TARGETS = tuple(
     for name in (
         "targets",
         "target_coding",
+        "target_file",
         "target_points",
         "target_tile",
         "target_values",
@@ -46,10 +47,11 @@ SOURCES = (
     *("coder", "fast", "fast_v3", "trellis", "mask", "mask_levels", "predict", "labels"),
     *("lifting", "head", "quantise", "values", "crc32c", "prior_bytes", "priors", "inflate"),
     *("settings", "coding", "plan", "differences", "tile", "choose", "encode", "chunk", "part"),
-    "fhash",
+    *("fhash", "file", "json", "zip", "zarr", "variable", "volume", "chunks", "reading"),
+    *("plain", "paper"),
 )
 """Files of NATIVE that are always fuzzed."""
-LIBRARIES = ("zlib", "zstd")
+LIBRARIES = ("yyjson", "zlib", "zstd")
 """Folders of NATIVE / "third_party", in C, which only the address sanitizer watches."""
 CODEC_SOURCES = (*("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head"),)
 """Files of CODEC that are always fuzzed."""

@@ -5,7 +5,9 @@ Some inputs are coded here, others are tiles of the golden containers.
 
 from __future__ import annotations
 
+import io
 import struct
+import zipfile
 from collections import Counter
 from collections.abc import Iterator
 from itertools import count
@@ -54,10 +56,11 @@ NAMES = (
     "samples",
     "points",
     "tile",
+    "file",
     "march",
 )
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
-CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_, TILE, _ = range(len(NAMES))
+CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_, TILE, FILE, _ = range(len(NAMES))
 PLAIN, TRELLIS, FAST, FAST_TRELLIS = range(4)
 """Ways to code integers, as inputs of the coder name them."""
 WITH_SEEDS = (CODER, PREDICTOR)
@@ -204,6 +207,8 @@ def write_seeds(
             put(MASK, bytes([*(n - 1 for n in shape), 0]), coded)
     for shape, labels, data in label_streams():
         put(LABELS, bytes([*(n - 1 for n in shape)]), struct.pack("<H", labels - 1), data)
+    for path in sorted(GOLDENS.glob("*.fhz")):
+        put(FILE, b"\x03", _stored(path))
     for target in range(len(NAMES)):
         if target in WITH_SEEDS:
             continue
@@ -274,3 +279,18 @@ def _predictor(levels: tuple[int, ...], order: tuple[int, ...], reach: int) -> P
     taps = sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))  # type: ignore[arg-type]
     weights = tuple(int(weight) for weight in np.random.default_rng(taps).integers(-600, 600, taps))
     return Predictor(step=1.0, origin=0.0, levels=levels, order=order, reach=reach, weights=weights)  # type: ignore[arg-type]
+
+
+def _stored(path: Path) -> bytes:
+    """A container whose documents are not deflated, so that mutations change their text.
+
+    The target mends the digest in the comment.
+    """
+    target = io.BytesIO()
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(target, "w") as copy:
+        for name in source.namelist():
+            info = zipfile.ZipInfo(name)  # of 1980, as members are
+            info.create_system, info.external_attr = 3, 0x81A40000
+            copy.writestr(info, source.read(name))
+        copy.comment = source.comment
+    return target.getvalue()

@@ -23,6 +23,7 @@ void slopes(Reader& in);              // target_slopes.cpp
 void samples(Reader& in);             // target_samples.cpp
 void points(Reader& in);              // target_points.cpp
 void tile(Reader& in);                // target_tile.cpp
+void file(Reader& in);                // target_file.cpp
 #if defined(FHASH_FUZZ_MARCH)
 void march(Reader& in);  // target_march.cpp
 #endif
@@ -287,9 +288,9 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     static const int only = only_target();
     Reader in(data, size);
 #if defined(FHASH_FUZZ_MARCH)
-    const int targets = 17;
+    const int targets = 18;
 #else
-    const int targets = 16;
+    const int targets = 17;
 #endif
     const int chosen = in.byte() % targets;
     switch (only < 0 ? chosen : only) {
@@ -309,6 +310,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         case 13: samples(in); break;
         case 14: points(in); break;
         case 15: tile(in); break;
+        case 16: file(in); break;
 #if defined(FHASH_FUZZ_MARCH)
         default: march(in);
 #endif
