@@ -44,12 +44,15 @@ GNU_FLAGS = [
     "-fno-trapping-math",
     "-fopenmp-simd",
     "-fvisibility=hidden",
+    "-ffunction-sections",
     "-Wno-psabi",  # functions that take vectors are inlined: no call depends on how one passes them
     "-g0",
 ]
 GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if TARGET or sys.platform == "linux" else []
 """Debug records and symbol tables would make the libraries five times as large; on Windows they
 would lie beside them."""
+if "linux" in (TARGET or sys.platform):
+    GNU_LINK_FLAGS.append("-Wl,--gc-sections")  # what third_party has and nobody calls
 LIBFHASH_FLAGS = (
     (f"-Wl,--version-script={FORMATS / 'exports.map'}", "-Wl,-soname,libfhash.so")
     if "linux" in (TARGET or sys.platform)

@@ -391,7 +391,7 @@ bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, C
 // A tile whose finite values all decode to one value.
 bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
               fhash_error& error) {
-    const int64_t whole = (int64_t)center;
+    const int64_t whole = origin.zero() ? 0 : (int64_t)center;
     const Draft draft = {{{0, 0, 0, 0}}, 1.0, center, center, center, 0, true, false, false, origin,
                          whole, whole};
     const auto settings = draft.settings(task.context, error);
