@@ -119,9 +119,10 @@ void quantise_all(const std::vector<T>& coefficients, double step, std::vector<i
 bool encode_integers(std::vector<int32_t>& integers, const Shape& shape, const Table& table,
                      const IntegerCoding& how, Buffer& out, fhash_error& error) {
     const int64_t bands = (int64_t)table.size() / TABLE_COLUMNS;
-    const std::vector<int32_t> given = integers;
     // Each time the original integers: coding the chosen ones would give other bytes, because rows
-    // that became empty are signalled differently.
+    // that became empty are signalled differently. The coder writes to them only where it chooses.
+    std::vector<int32_t> given;
+    if (how.scaled && !how.fast) given = integers;
     const auto encode = [&](uint8_t* data, int64_t capacity) -> int64_t {
         if (how.fast) {
             double results[2];
@@ -132,7 +133,7 @@ bool encode_integers(std::vector<int32_t>& integers, const Shape& shape, const T
                                      prior.defaults.data(), data, capacity, results);
         }
         const State& prior = integer_prior(how.trellis);
-        integers = given;
+        if (how.scaled) integers = given;
         // The state is not kept, so that nothing is written to the prior.
         return fhash_encode(integers.data(), how.scaled, how.weight, how.trellis, shape.data(),
                             table.data(), bands, const_cast<uint16_t*>(prior.slots.data()),
@@ -194,9 +195,10 @@ bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficien
     const int64_t largest = largest_of(integers);
     if ((double)largest >= LARGEST) return false;
     const bool chooses = coding.weight > 0;
-    const std::vector<int32_t> nearest = integers;
-    if (!encode({false, fast, chooses ? scaled.data() : nullptr, coding.weight})) return false;
     const bool mended = largest >= MAX_CHOSEN && chooses && settings.real64;
+    std::vector<int32_t> nearest;
+    if (mended) nearest = integers;
+    if (!encode({false, fast, chooses ? scaled.data() : nullptr, coding.weight})) return false;
     for (size_t i = 0; mended && i < integers.size(); i++)
         if (std::abs((int64_t)nearest[i]) >= MAX_CHOSEN)
             integers[i] = (int32_t)std::nearbyint(coefficients[i] / (T)settings.step);

@@ -387,9 +387,11 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     std::vector<int32_t> integers, residual;
     if (!code_coefficients(*search, coefficients, task.coding, body, integers, error)) return false;
     coded.nonzero = (int64_t)integers.size() - std::count(integers.begin(), integers.end(), 0);
+    coefficients = {};
     std::vector<T>& linear = target;
     if (!linear_values(settings, *search->inverse, integers.data(), linear.data(), error))
         return false;
+    integers = {};
     if (settings.mask && !mask_section<T>(task, linear.data(), mask, error)) return false;
     if constexpr (std::is_same<T, float>::value) {
         if (settings.head) {
