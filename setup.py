@@ -102,7 +102,10 @@ WASM_LINK_FLAGS = [
     "-mexec-model=reactor",
     "-Wl,-s,--gc-sections,--stack-first,--lto-O2,-z,stack-size=1048576",
 ]
-WASM_LEFT_OUT = {"fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"}
+WASM_LEFT_OUT = {
+    *("fhash_open_path", "fhash_tile_encode", "fhash_tile_bound"),
+    *("fhash_tile_code", "fhash_tile_free"),
+}
 """Functions that a page has no use for: there are no paths, and nothing is encoded."""
 
 

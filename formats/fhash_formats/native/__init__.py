@@ -67,7 +67,7 @@ _TILES: Prototypes = {
     "fhash_tile_bound": (ARRAY,),
     "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),
 }
-"""Functions of fhash.h, chunk.cpp and part.cpp, whose result is an int32."""
+"""Functions of fhash.h and part.cpp, whose result is an int32."""
 _RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.c_size_t}
 """Other results."""
 

@@ -556,20 +556,20 @@ int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const 
     });
 }
 
-// Code a tile with the settings of `tile`; without any it is stored without loss.
-//
-// in_coreset: the values that count, or without settings the mask of the stream; null for all.
-// decoded: room for the decoded values, or null.
-// data, size: get the stream, which fhash_tile_free releases. nonzero: coded integers other than 0.
-FHASH_EXPORT int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile,
-                                     const void* values, const uint8_t* in_coreset,
-                                     const fhash_coding* coding, void* decoded, uint8_t** data,
-                                     size_t* size, int64_t* nonzero, fhash_error* error) {
+int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile, const void* values,
+                        const uint8_t* in_coreset, const fhash_coding* coding, void* decoded,
+                        uint8_t** data, size_t* size, int64_t* nonzero, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
-        if (!is_shape(tile->shape))
-            return fail(failed, FHASH_ERROR_ARGUMENT, "a tile has four lengths");
+        if (!context || !tile || !values || !coding || !data || !size || !nonzero)
+            return fail(failed, FHASH_ERROR_ARGUMENT, "a context, a tile, its values, options and "
+                                                      "room for the results are needed");
+        const bool sound = coding->weight >= 0 && std::isfinite(coding->weight);
+        if (!is_shape(tile->shape) || !fhash_type_size(tile->type) || !sound)
+            return fail(failed, FHASH_ERROR_ARGUMENT,
+                        "a tile has four lengths and a type, and a bit a weight from 0 on");
         Shape shape;
         std::copy_n(tile->shape, 4, shape.begin());
+        if (!may_use(*context, 96 * (uint64_t)vertices(shape), failed)) return false;
         Coded coded;
         if (tile->settings) {
             const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
@@ -590,7 +590,7 @@ FHASH_EXPORT int32_t fhash_tile_code(fhash_context* context, const fhash_tile* t
     });
 }
 
-FHASH_EXPORT int32_t fhash_tile_free(uint8_t* data) {
+int32_t fhash_tile_free(uint8_t* data) {
     std::free(data);
     return 0;
 }

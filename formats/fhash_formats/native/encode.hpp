@@ -5,12 +5,6 @@
 #include "numbers.hpp"
 #include "tile.hpp"
 
-// Options of the encoder: how hard it works, what it keeps (transform/tile.py describes them).
-struct fhash_coding {
-    double weight, error;  // error below 0: no bound
-    int32_t rounds, rough, passes, filled, density, keep_missing, own_settings, fast;
-};
-
 namespace fhash {
 
 constexpr double LARGEST = 1e9;                 // largest magnitude of an integer

@@ -122,6 +122,31 @@ FHASH_API int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* ti
 /* Bytes that are enough for any stream of a tile of this shape and type. */
 FHASH_API size_t fhash_tile_bound(const fhash_tile* tile);
 
+/* Options of an encoder whose settings are given. */
+typedef struct fhash_coding {
+    double weight;        /* squared steps that a bit is worth in rate-distortion optimisation; 0 for none */
+    double error;         /* bound on |decoded - value|; below 0 for none. A tile that cannot keep it is exact */
+    int32_t rounds;       /* how often values that are free to change are replaced by their decoded ones */
+    int32_t rough;        /* 1: by those of the nearest integers, not of the chosen ones */
+    int32_t passes;       /* 1, or 2: what was chosen is coded or searched once more */
+    int32_t filled;       /* 1: values that do not count are a good filling already */
+    int32_t density;      /* how thoroughly a filling is searched: 0, 1, 2, 4 or 8 thresholds per factor of two */
+    int32_t keep_missing; /* 1: values that are not finite come back as they were */
+    int32_t own_settings; /* 1: the stream holds the settings */
+    int32_t fast;         /* 1: the fast coder, for more bytes */
+} fhash_coding;
+
+/* Encode a tile with the settings of tile->settings: any transform, basis, head, predictor, mask or labels that they
+ * ask for. Without settings it is stored without loss.
+ *
+ * counts: NULL, or a byte for each value: 0 where it does not count. Without settings it is the mask of the stream.
+ * decoded: NULL, or room for the values that the stream decodes to.
+ * stream, size: get the stream, which fhash_tile_free releases. nonzero: gets the coded integers other than 0. */
+FHASH_API int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile, const void* values,
+                                  const uint8_t* counts, const fhash_coding* coding, void* decoded, uint8_t** stream,
+                                  size_t* size, int64_t* nonzero, fhash_error* error);
+FHASH_API int32_t fhash_tile_free(uint8_t* stream);
+
 /* ---- Files ---- */
 
 /* Reads `length` bytes from `offset` on. Returns 0, or another number where it cannot. */
