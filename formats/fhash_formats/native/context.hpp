@@ -27,6 +27,8 @@ struct fhash_context {
 
 namespace fhash {
 
+using Buffer = std::vector<uint8_t>;
+
 // Whether a call may use so many bytes; fails otherwise.
 inline bool may_use(const fhash_context& context, uint64_t bytes, fhash_error& error) {
     if (bytes > SIZE_MAX / 2) return fail(error, FHASH_ERROR_MEMORY, "no memory");

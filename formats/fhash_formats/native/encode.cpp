@@ -164,19 +164,9 @@ bool encode_task_exactly(const Task& task, Coded& coded, fhash_error& error) {
 // The section of the mask, from decoded values before head and residual.
 template <class T, class L>
 bool mask_section(const Task& task, const L* linear, Buffer& out, fhash_error& error) {
-    const MaskScores& mask = *task.settings.mask;
-    const std::vector<T> values(linear, linear + task.size());
-    const std::vector<T> edges(mask.edges.begin(), mask.edges.end());
-    Mask first(values.size(), 0), second(values.size(), 0);
-    const auto any = [](const auto& list) {
-        return std::any_of(list.begin(), list.end(), [](int32_t n) { return n != 0; });
-    };
-    if ((any(mask.scores) || any(mask.others)) &&
-        !kernel_done(mask_levels(values.data(), task.shape.data(), edges.data(),
-                                 (int64_t)edges.size(), mask.scores.data(),
-                                 mask.others.empty() ? nullptr : mask.others.data(), mask.reach,
-                                 first.data(), second.data()),
-                     "the levels of a mask", error))
+    Mask first((size_t)task.size()), second((size_t)task.size());
+    if (!levels_of_mask<T>(*task.settings.mask, task.shape, linear, first.data(), second.data(),
+                           error))
         return false;
     return pack_mask(task.occupied(), task.shape, first, second, out, error);
 }
@@ -206,19 +196,9 @@ bool encode_foretold(const Task& task, Coded& coded, fhash_error& error) {
     Buffer body;
     if (!encode_predicted(predictor, task.shape, task.counts(), integers, body, error))
         return false;
-    std::vector<double> linear((size_t)task.size());
-    for (size_t i = 0; i < linear.size(); i++) {
-        const double value = (double)integers[i] * predictor.step + predictor.origin;
-        const double raised = value < settings.low ? settings.low : value;
-        linear[i] = raised > settings.high ? settings.high : raised;
-    }
+    const std::vector<double> linear = foretold_values(settings, integers);
     coded.decoded.resize(task.bytes());
-    with_type(task.type, [&](auto value) {
-        auto* const decoded = (decltype(value)*)(void*)coded.decoded.data();
-        cast_all(linear.data(), decoded, task.size());
-        clip_range(decoded, task.size(), settings);
-        return true;
-    });
+    correct_within(settings, task.type, linear.data(), {}, task.size(), coded.decoded.data());
     if (!keeps_bound(task, coded)) return encode_task_exactly(task, coded, error);
     Sections sections(PREDICTED, task.own(), settings.mask != nullptr);
     if (!task.missing.empty()) sections.add(MISSING, task.missing);
@@ -350,29 +330,6 @@ bool make_residual(const Task& task, const T* base, std::vector<int32_t>& residu
     return nonzero >= 0;
 }
 
-// Decoded values from those before head and residual, within the range.
-template <class T>
-void decode_base(const Task& task, const T* base, const std::vector<int32_t>& residual,
-                 Coded& coded) {
-    const int64_t n = task.size();
-    coded.decoded.resize(task.bytes());
-    with_type(task.type, [&](auto value) {
-        using O = decltype(value);
-        O* const decoded = (O*)(void*)coded.decoded.data();
-        if (residual.empty()) {
-            cast_all(base, decoded, n);
-        } else if constexpr (std::is_floating_point<O>::value) {
-            correct(base, residual.data(), n, task.settings.quantum, decoded);
-        } else {
-            std::vector<double> sums((size_t)n);
-            correct(base, residual.data(), n, task.settings.quantum, sums.data());
-            cast_all(sums.data(), decoded, n);
-        }
-        clip_range(decoded, n, task.settings);
-        return true;
-    });
-}
-
 // The stream of a transformed tile; false without an error where it has to be stored exactly.
 template <class T>
 bool transformed(const Task& task, Coded& coded, fhash_error& error) {
@@ -403,7 +360,9 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     }
     const bool bound = task.coding.error >= 0;
     if (bound && !make_residual(task, linear.data(), residual)) return false;
-    decode_base(task, linear.data(), residual, coded);
+    coded.decoded.resize(task.bytes());
+    correct_within(settings, task.type, linear.data(), residual, task.size(),
+                   coded.decoded.data());
     if (bound && !keeps_bound(task, coded)) return false;
     Sections sections(TRANSFORMED, task.own(), settings.mask != nullptr);
     if (task.coding.fast) sections.flags |= FAST;

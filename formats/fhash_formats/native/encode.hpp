@@ -14,8 +14,6 @@ constexpr double ROUNDING = 0.4;                // added to a magnitude before r
 constexpr double TRELLIS_SHARE = 0.65;
 constexpr int8_t PLAIN_OFFSETS[OFFSET_COUNT] = {-5, -1, 0, 0, 0, 0};
 
-using Buffer = std::vector<uint8_t>;
-
 // A coded tile.
 struct Coded {
     Buffer data;

@@ -33,14 +33,13 @@ Part widened(const Part& part, const Shape& shape, const Head& head) {
 }
 
 // A part of an array as an array of its own.
-template <class I, class O>
-std::vector<O> copied(const I* in, const Shape& shape, const Part& part) {
-    std::vector<O> out;
+std::vector<float> copied(const float* in, const Shape& shape, const Part& part) {
+    std::vector<float> out;
     out.reserve((size_t)vertices(part.shape()));
     for (int64_t t = part.first[0]; t < part.last[0]; t++)
         for (int64_t z = part.first[1]; z < part.last[1]; z++)
             for (int64_t y = part.first[2]; y < part.last[2]; y++) {
-                const I* const row = in + ((t * shape[1] + z) * shape[2] + y) * shape[3];
+                const float* const row = in + ((t * shape[1] + z) * shape[2] + y) * shape[3];
                 out.insert(out.end(), row + part.first[3], row + part.last[3]);
             }
     return out;
@@ -211,37 +210,32 @@ FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* t
                                      const float* table, const int64_t* part, void* values,
                                      fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
-        const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
-                                              tile->settings_size, failed);
-        if (!settings) return false;
-        Shape shape;
-        std::copy_n(tile->shape, 4, shape.begin());
-        Part some;
-        if (!is_shape(tile->shape) || !is_part(part, shape, some) || !settings->head)
-            return fail(failed, FHASH_ERROR_ARGUMENT, "a part lies in its tile, which has a head");
-        // At the ends of the tile the head sees its edge either way; farther in, what it sees
-        // instead of what was cut off is cut off again.
-        const Part wide = widened(some, shape, *settings->head);
-        const std::vector<float> base = copied<float, float>(table, shape, wide);
-        std::vector<float> head(base.size());
-        if (!apply_head(*context, *settings->head, base.data(), wide.shape(), head.data(), failed))
-            return false;
-        Part inner;
-        for (int a = 0; a < 4; a++) {
-            inner.first[a] = some.first[a] - wide.first[a];
-            inner.last[a] = some.last[a] - wide.first[a];
-        }
-        const std::vector<float> kept = copied<float, float>(head.data(), wide.shape(), inner);
-        const int64_t n = (int64_t)kept.size();
-        const bool about = !settings->origin.zero();
-        const bool done = with_type(about ? FHASH_INT64 : tile->type, [&](auto type) {
-            auto* const out = (decltype(type)*)values;
-            cast_all(kept.data(), out, n);
-            clip_range(out, n, *settings);
+        return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
+            Part some;
+            if (!is_part(part, shape, some) || !settings->head)
+                return fail(failed, FHASH_ERROR_ARGUMENT,
+                            "a part lies in its tile, which has a head");
+            // At the ends of the tile the head sees its edge either way; farther in, what it sees
+            // instead of what was cut off is cut off again.
+            const Part wide = widened(some, shape, *settings->head);
+            const std::vector<float> base = copied(table, shape, wide);
+            std::vector<float> head(base.size());
+            if (!apply_head(*context, *settings->head, base.data(), wide.shape(), head.data(),
+                            failed))
+                return false;
+            Part inner;
+            for (int a = 0; a < 4; a++) {
+                inner.first[a] = some.first[a] - wide.first[a];
+                inner.last[a] = some.last[a] - wide.first[a];
+            }
+            const std::vector<float> kept = copied(head.data(), wide.shape(), inner);
+            const int64_t n = (int64_t)kept.size();
+            const bool about = !settings->origin.zero();
+            correct_within(*settings, about ? (int32_t)FHASH_INT64 : tile->type, kept.data(), {}, n,
+                           values);
+            if (about) add_origin((int64_t*)values, n, settings->origin, tile->type);
             return true;
         });
-        if (done && about) add_origin((int64_t*)values, n, settings->origin, tile->type);
-        return done;
     });
 }
 

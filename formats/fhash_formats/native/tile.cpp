@@ -56,46 +56,13 @@ bool read_mask_by(const Job& job, const L* linear, uint8_t* occupied, fhash_erro
     if (!job.settings->mask)
         return fail(error, FHASH_ERROR_DAMAGED,
                     "a coded tile has a mask, but its settings have no mask levels");
-    const MaskScores& mask = *job.settings->mask;
     std::vector<uint8_t> first((size_t)job.size()), second((size_t)job.size());
-    const auto any = [](const auto& list) {
-        return std::any_of(list.begin(), list.end(), [](int32_t n) { return n != 0; });
-    };
-    if (job.stream.mask.left() && (any(mask.scores) || any(mask.others))) {
-        const std::vector<T> edges(mask.edges.begin(), mask.edges.end());
-        std::vector<T> cast_values;
-        const T* values;
-        if constexpr (std::is_same<T, L>::value) {
-            values = linear;
-        } else {
-            cast_values.assign(linear, linear + job.size());
-            values = cast_values.data();
-        }
-        const int64_t code = mask_levels(
-            values, job.shape.data(), edges.data(), (int64_t)edges.size(), mask.scores.data(),
-            mask.others.empty() ? nullptr : mask.others.data(), mask.reach, first.data(),
-            second.data());
-        if (!kernel_done(code, "the mask of a tile is damaged", error)) return false;
-    }
+    if (job.stream.mask.left() &&
+        !levels_of_mask<T>(*job.settings->mask, job.shape, linear, first.data(), second.data(),
+                           error))
+        return false;
     return read_mask(job, first.data(), second.data(), occupied, error);
 }
-
-}  // namespace
-
-bool check_numbers(const Settings& settings, int32_t type, double& largest, fhash_error& error) {
-    largest = settings.real64 ? DBL_MAX : FLT_MAX;
-    const bool floats = type >= FHASH_FLOAT16;
-    if (type == FHASH_FLOAT32) largest = std::min<double>(largest, FLT_MAX);
-    if (type == FHASH_FLOAT16) largest = 65504;
-    const double reach =
-        std::max({std::fabs(settings.low), std::fabs(settings.high), std::fabs(settings.center)});
-    if (floats && reach > largest)
-        return fail(error, FHASH_ERROR_DAMAGED,
-                    "the range of a coded tile or its centre is beyond %.6g", largest);
-    return true;
-}
-
-namespace {
 
 template <class O>
 bool decode_exact(const Job& job, O* values, uint8_t* occupied, fhash_error& error) {
@@ -163,16 +130,6 @@ bool finish(const Job& job, O* values, const uint8_t* occupied, fhash_error& err
     }
 }
 
-// Values in the type of the array, within the range of the settings.
-template <class T> void cast_within(const Job& job, const T* in, int64_t n, void* out) {
-    with_type(job.coded_type(), [&](auto type) {
-        auto* const values = (decltype(type)*)out;
-        if ((const void*)in != out) cast_all(in, values, n);
-        clip_range(values, n, *job.settings);
-        return true;
-    });
-}
-
 bool decode_foretold(const Job& job, void* values, uint8_t* occupied, fhash_error& error) {
     const Settings& settings = *job.settings;
     if (!settings.predictor)
@@ -180,29 +137,24 @@ bool decode_foretold(const Job& job, void* values, uint8_t* occupied, fhash_erro
                     "a tile is coded by prediction, but its settings have no predictor");
     const int64_t n = job.size();
     const Predictor& predictor = *settings.predictor;
-    std::vector<double> linear((size_t)n);
-    {
-        std::vector<int32_t> integers((size_t)n);
-        if (!decode_predicted(job.stream.body.at, job.stream.body.left(), job.shape, predictor,
-                              integers.data(), error))
-            return false;
-        for (int64_t i = 0; i < n; i++) {
-            const double value = (double)integers[(size_t)i] * predictor.step + predictor.origin;
-            const double raised = value < settings.low ? settings.low : value;
-            linear[(size_t)i] = raised > settings.high ? settings.high : raised;
-        }
-    }
+    std::vector<int32_t> integers((size_t)n);
+    if (!decode_predicted(job.stream.body.at, job.stream.body.left(), job.shape, predictor,
+                          integers.data(), error))
+        return false;
+    const std::vector<double> linear = foretold_values(settings, integers);
+    integers = {};
+    const int32_t type = job.coded_type();
     if (job.lod) {
         std::vector<double> some((size_t)vertices(job.out_shape()));
         thin(linear.data(), job.shape, job.lod, some.data());
-        cast_within(job, some.data(), (int64_t)some.size(), values);
+        correct_within(settings, type, some.data(), {}, (int64_t)some.size(), values);
         return true;
     }
     const bool masked = job.stream.mask.at;
     if (masked && !(settings.real64 ? read_mask_by<double>(job, linear.data(), occupied, error)
                                     : read_mask_by<float>(job, linear.data(), occupied, error)))
         return false;
-    cast_within(job, linear.data(), n, values);
+    correct_within(settings, type, linear.data(), {}, n, values);
     return true;
 }
 
@@ -249,32 +201,15 @@ bool correct_by_head(const Job& job, float*& base, std::vector<float>& room, fha
 }
 bool correct_by_head(const Job&, double*&, std::vector<double>&, fhash_error&) { return true; }
 
-// Values with their residual in the type of the array, within the range. base: may be `values`.
-template <class T>
-bool add_residual(const Job& job, const T* base, const std::vector<int32_t>& residual,
-                  double largest, void* values, fhash_error& error) {
-    const Settings& settings = *job.settings;
-    const int64_t n = job.size();
-    const bool may_exceed = !settings.clip && settings.quantum * 0x1p31 > largest / 2;
-    bool exceeds = false;
-    const auto finish_sums = [&](auto* sums) {
-        correct(base, residual.data(), n, settings.quantum, sums);
-        for (int64_t i = 0; may_exceed && i < n; i++) exceeds |= std::isinf(sums[i]);
-        cast_within(job, sums, n, values);
-    };
-    if (job.coded_type() == FHASH_FLOAT32) {
-        finish_sums((float*)values);
-    } else {
-        std::vector<double> sums((size_t)n);
-        finish_sums(sums.data());
-        if (may_exceed && job.coded_type() == FHASH_FLOAT16)
-            for (const double sum : sums) exceeds |= (to_half(sum) & 0x7fff) == 0x7c00;
-    }
-    // Without a residual the values are within the range, and finite; clipped ones are in the end.
-    if (exceeds && job.coded_type() >= FHASH_FLOAT16)
-        return fail(error, FHASH_ERROR_DAMAGED, "a residual of a coded tile is beyond %.6g",
-                    largest);
-    return true;
+// Whether a value of a floating type is infinite.
+bool any_infinite(const void* values, int32_t type, int64_t n) {
+    return with_type(type, [&](auto kind) {
+        using O = decltype(kind);
+        if constexpr (is_real<O>)
+            return std::any_of((const O*)values, (const O*)values + n,
+                               [](O value) { return std::isinf(real(value)); });
+        else return false;
+    });
 }
 
 template <class T>
@@ -287,7 +222,8 @@ bool decode_transformed(const Job& job, void* values, uint8_t* occupied, double 
     std::vector<int32_t> residual((size_t)(job.stream.residual.at && !job.lod ? n : 0));
     // Where the sizes are the same, integers, values before the head, and values share the room.
     constexpr bool narrow = std::is_same<T, float>::value;
-    const bool direct = narrow && job.coded_type() == FHASH_FLOAT32 && !job.lod;
+    const int32_t type = job.coded_type();
+    const bool direct = narrow && type == FHASH_FLOAT32 && !job.lod;
     std::vector<int32_t> integers((size_t)(direct ? 0 : n));
     int32_t* const coefficients = direct ? (int32_t*)values : integers.data();
     if (!read_integers(job, plan->table, coefficients, residual, error)) return false;
@@ -296,13 +232,17 @@ bool decode_transformed(const Job& job, void* values, uint8_t* occupied, double 
     T* linear = over ? (T*)(void*)coefficients : room.data();
     if (!linear_values(settings, *plan, coefficients, linear, error)) return false;
     if (job.lod) {
-        cast_within(job, linear, count, values);
+        correct_within(settings, type, linear, {}, count, values);
         return true;
     }
     if (job.stream.mask.at && !read_mask_by<T>(job, linear, occupied, error)) return false;
     if (!correct_by_head(job, linear, corrected, error)) return false;
-    if (!residual.empty()) return add_residual(job, linear, residual, largest, values, error);
-    cast_within(job, linear, n, values);
+    correct_within(settings, type, linear, residual, n, values);
+    // Without a residual the values are within the range, and finite; clipped ones are in the end.
+    const bool may_exceed = !settings.clip && settings.quantum * 0x1p31 > largest / 2;
+    if (!residual.empty() && may_exceed && any_infinite(values, type, n))
+        return fail(error, FHASH_ERROR_DAMAGED, "a residual of a coded tile is beyond %.6g",
+                    largest);
     return true;
 }
 
@@ -360,6 +300,88 @@ bool is_shape(const int64_t* shape) {
     }
     return true;
 }
+
+bool check_numbers(const Settings& settings, int32_t type, double& largest, fhash_error& error) {
+    largest = settings.real64 ? DBL_MAX : FLT_MAX;
+    const bool floats = type >= FHASH_FLOAT16;
+    if (type == FHASH_FLOAT32) largest = std::min<double>(largest, FLT_MAX);
+    if (type == FHASH_FLOAT16) largest = 65504;
+    const double reach =
+        std::max({std::fabs(settings.low), std::fabs(settings.high), std::fabs(settings.center)});
+    if (floats && reach > largest)
+        return fail(error, FHASH_ERROR_DAMAGED,
+                    "the range of a coded tile or its centre is beyond %.6g", largest);
+    return true;
+}
+
+template <class T, class L>
+bool levels_of_mask(const MaskScores& mask, const Shape& shape, const L* linear, uint8_t* first,
+                    uint8_t* second, fhash_error& error) {
+    const int64_t n = vertices(shape);
+    std::fill_n(first, n, (uint8_t)0);
+    std::fill_n(second, n, (uint8_t)0);
+    const auto any = [](const auto& list) {
+        return std::any_of(list.begin(), list.end(), [](int32_t score) { return score != 0; });
+    };
+    if (!any(mask.scores) && !any(mask.others)) return true;
+    const std::vector<T> edges(mask.edges.begin(), mask.edges.end());
+    std::vector<T> cast_values;
+    const T* values;
+    if constexpr (std::is_same<T, L>::value) {
+        values = linear;
+    } else {
+        cast_values.assign(linear, linear + n);
+        values = cast_values.data();
+    }
+    const int64_t code = mask_levels(values, shape.data(), edges.data(), (int64_t)edges.size(),
+                                     mask.scores.data(),
+                                     mask.others.empty() ? nullptr : mask.others.data(),
+                                     mask.reach, first, second);
+    return kernel_done(code, "the mask of a tile is damaged", error);
+}
+template bool levels_of_mask<float>(const MaskScores&, const Shape&, const float*, uint8_t*,
+                                    uint8_t*, fhash_error&);
+template bool levels_of_mask<float>(const MaskScores&, const Shape&, const double*, uint8_t*,
+                                    uint8_t*, fhash_error&);
+template bool levels_of_mask<double>(const MaskScores&, const Shape&, const double*, uint8_t*,
+                                     uint8_t*, fhash_error&);
+
+std::vector<double> foretold_values(const Settings& settings,
+                                    const std::vector<int32_t>& integers) {
+    const Predictor& predictor = *settings.predictor;
+    std::vector<double> values;
+    values.reserve(integers.size());
+    for (const int32_t q : integers) {
+        const double value = (double)q * predictor.step + predictor.origin;
+        const double raised = value < settings.low ? settings.low : value;
+        values.push_back(raised > settings.high ? settings.high : raised);
+    }
+    return values;
+}
+
+template <class T>
+void correct_within(const Settings& settings, int32_t type, const T* base,
+                    const std::vector<int32_t>& residual, int64_t n, void* out) {
+    with_type(type, [&](auto kind) {
+        using O = decltype(kind);
+        O* const values = (O*)out;
+        if (residual.empty()) {
+            if ((const void*)base != out) cast_all(base, values, n);
+        } else if constexpr (std::is_floating_point<O>::value) {
+            correct(base, residual.data(), n, settings.quantum, values);
+        } else {
+            std::vector<double> sums((size_t)n);
+            correct(base, residual.data(), n, settings.quantum, sums.data());
+            cast_all(sums.data(), values, n);
+        }
+        clip_range(values, n, settings);
+        return true;
+    });
+}
+template void correct_within(const Settings&, int32_t, const float*, const std::vector<int32_t>&,
+                             int64_t, void*);
+template void correct_within(const Settings&, int32_t, const double*, const std::vector<int32_t>&,
+                             int64_t, void*);
 
 bool apply_head(const fhash_context& context, const Head& head, const float* in, const Shape& shape,
                 float* out, fhash_error& error) {

@@ -54,6 +54,20 @@ template <class T> bool decode_linear(const Job& job, T* values, fhash_error& er
 template <class O>
 bool decode_differences(Bytes body, const Shape& shape, O* values, fhash_error& error);
 
+// Two levels of each vertex from the values before head and residual, which are compared in T.
+template <class T, class L>
+bool levels_of_mask(const MaskScores& mask, const Shape& shape, const L* linear, uint8_t* first,
+                    uint8_t* second, fhash_error& error);
+
+// Values of predicted integers, within the range.
+std::vector<double> foretold_values(const Settings& settings, const std::vector<int32_t>& integers);
+
+// Values with their residual in a type, within the range of the settings. residual: empty for none.
+// out: room for them; may be `base`.
+template <class T>
+void correct_within(const Settings& settings, int32_t type, const T* base,
+                    const std::vector<int32_t>& residual, int64_t n, void* out);
+
 // Values of vertices of a level of detail out of those of all vertices.
 template <class O> void thin(const O* in, const Shape& shape, int lod, O* out) {
     const Shape less = lod_shape(shape, lod);

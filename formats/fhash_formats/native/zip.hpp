@@ -10,8 +10,6 @@
 
 namespace fhash {
 
-using Buffer = std::vector<uint8_t>;
-
 // A file that the caller's function reads. Its end is kept: small files are read once.
 struct Source {
     const fhash_context* context = nullptr;

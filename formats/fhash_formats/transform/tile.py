@@ -293,22 +293,19 @@ def encode_for(tile: Values, quality: tuple[Any, ...], fill: Values | None) -> b
     return room[: size.value].tobytes()
 
 
-def exact_tile(
-    values: Values, settings: None = None, occupied: Mask | None = None, *, origin: int = 0
-) -> CodedTile:
+def exact_tile(values: Values, occupied: Mask | None = None, *, origin: int = 0) -> CodedTile:
     """A tile stored without loss: its bytes, those of equal weight together, deflated.
 
     Args:
         values: the tile (t, z, y, x), of any real type.
-        settings: None, for a stream without settings of its own.
         occupied: the mask, for a stream with one. Values outside of it become NaN, or 0 for
             integers.
         origin: integer that is subtracted from the values, where they have not lost it yet.
     """
     if origin:
-        coded = exact_tile(about_origin(values, origin), settings, occupied)
+        coded = exact_tile(about_origin(values, origin), occupied)
         return replace(coded, decoded=at_origin(coded.decoded, origin, values.dtype))
-    return _coded(values, settings, _DEFAULT_CODING, occupied)
+    return _coded(values, None, _DEFAULT_CODING, occupied)
 
 
 def _coded(

@@ -69,8 +69,10 @@ def tool(*words: object, **environment: str) -> str:
 
 def pvpython() -> list[str]:
     """The words that run pvpython without a screen; skips where it is not installed."""
-    words = ["xvfb-run", "-a", "pvpython"]
-    for word in (words[0], words[2]):
+    # pvpython first opens and closes a connection: the server must not start anew after that, since
+    # the next one would be refused meanwhile.
+    words = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24 -noreset", "pvpython"]
+    for word in (words[0], words[-1]):
         if shutil.which(word) is None:
             pytest.skip(f"{word} is not installed")
     return words
