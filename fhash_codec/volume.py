@@ -22,7 +22,7 @@ from fhash_codec.boxes import (
 )
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.header import describe_file, read_missing
+from fhash_codec.header import FileInfo, describe_file, read_missing
 from fhash_codec.measure.value_range import ValueRange, decoded_type
 from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
@@ -252,11 +252,8 @@ class Volume(Card, ArrayLike):
         return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
 
     @property
-    def info(self) -> dict[str, Any]:
-        """The container's header, and what follows from it.
-
-        Added are the path, bytes, raw bytes, ratio, key frames and arrays.
-        """
+    def info(self) -> FileInfo:
+        """The container's header, and what follows from it."""
         return describe_file(self.container, self.path, self.key_times.key_frames)
 
     def verify(self, progress: Progress = silent) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from math import floor, prod
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypeAlias, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from fhash_codec.boxes import Box, Mlp, Spans, Table
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
-from fhash_codec.header import metadata_of
+from fhash_codec.header import FileInfo, metadata_of
 from fhash_formats.container import Container
 from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, RESIDUAL, TABLE
 from fhash_formats.errors import InputError
@@ -53,6 +53,65 @@ def open_model(container: Container) -> VolumeModel:
     from fhash_codec.paper.model import PaperModel
 
     return PaperModel(container)
+
+
+class Stored(TypedDict):
+    """The place of a part of a model in its file."""
+
+    path: Annotated[str, "its array, group or document; empty where it has none"]
+    coding: Annotated[str, "codec, or what stands in its place"]
+    bytes: Annotated[int, "bytes that it takes in the file"]
+
+
+class CardSettings(Stored):
+    """The settings of a model."""
+
+    settings: Annotated[int, "how many there are"]
+
+
+class CardTable(Stored):
+    """A level of a model."""
+
+    level: Annotated[int, "number of the level, from 1"]
+    shape: Annotated[list[int], "key frames, z, y, x, numbers at a vertex"]
+    dtype: Annotated[str, "number type as read"]
+
+
+class CardLayer(Stored):
+    """A layer of a model."""
+
+    layer: Annotated[int, "number of the layer, from 1"]
+    shape: Annotated[list[int], "outputs and inputs"]
+    activation: Annotated[str, "`relu`, `leaky` or `linear`"]
+
+
+class CardOccupancy(Stored):
+    """The bits of the coreset."""
+
+    shape: Annotated[list[int], "key frames and bytes of each"]
+    apart: Annotated[list[str], "features that have bits of their own; empty where merged, or one"]
+
+
+class CardResidual(Stored):
+    """The values that a network lacks, at every vertex of the box and step."""
+
+    shape: Annotated[list[int], "steps, z, y, x"]
+
+
+class ModelCard(TypedDict):
+    """The parts of a model and where they lie in the file."""
+
+    config: Annotated[CardSettings, "the settings"]
+    tables: Annotated[list[CardTable], "levels, finest first"]
+    mlp: Annotated[list[CardLayer], "layers; empty where there is no network"]
+    occupancy: Annotated[CardOccupancy, "bits of the coreset"]
+    residual: NotRequired[Annotated[CardResidual, "what a network lacks, where it has a bound"]]
+
+
+class VolumeInfo(FileInfo):
+    """The header of a file, what follows from it, and its card."""
+
+    card: Annotated[ModelCard, "parts of the model and where they lie in the file"]
 
 
 class Card:
@@ -120,21 +179,14 @@ class Card:
         """
         return self._model.mlp
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> ModelCard:
         """The place of each part of the model in the file, as JSON values.
 
-        Each entry has `path` in the file, `coding` and `bytes`, which are those of the whole
-        document or array there. `path` is empty, and `bytes` 0, for what takes none of its own: a
-        coarser level that is decoded from the tiles of level 1, and an occupancy that is the whole
-        box.
-
-        Keys: `config` (with `settings`), `tables` (with `level`, `shape`, `dtype`), `mlp` (with
-        `layer`, `shape` of the weights, `activation`), `occupancy` (with `shape` of the bits,
-        and `apart`, the features that have bits of their own), and `residual` (with `shape`) where
-        a network has one.
+        `path` is empty, and `bytes` 0, for what takes none of its own: a coarser level that is
+        decoded from the tiles of level 1, and an occupancy that is the whole box.
         """
         settings = len(self.config)
-        return {
+        card: ModelCard = {
             "config": {
                 "path": "zarr.json",
                 "coding": "JSON, deflated",
@@ -152,15 +204,13 @@ class Card:
             ],
             "mlp": self._describe_mlp(),
             "occupancy": self._describe_occupancy(),
-            **({} if self._residual is None else {RESIDUAL: self._describe_residual()}),
         }
+        if self._residual is not None:
+            shape = list(self.container.arrays[RESIDUAL].shape)
+            card["residual"] = {"shape": shape, **self._stored(RESIDUAL, "")}
+        return card
 
-    def _describe_residual(self) -> dict[str, Any]:
-        """The values that the network lacks, at every vertex of the box and step."""
-        shape = list(self.container.arrays[RESIDUAL].shape)
-        return {"shape": shape, **self._stored(RESIDUAL, "")}
-
-    def _describe_mlp(self) -> list[dict[str, Any]]:
+    def _describe_mlp(self) -> list[CardLayer]:
         """The layers: in arrays of their own, all in one, or packed in the coded table."""
         count, together = len(self.mlp.weights), LAYERS in self.container.arrays
         return [
@@ -176,7 +226,7 @@ class Card:
             for number, weights in enumerate(self.mlp.weights, start=1)
         ]
 
-    def _describe_occupancy(self) -> dict[str, Any]:
+    def _describe_occupancy(self) -> CardOccupancy:
         """The bits of all key frames, or what stands in their place."""
         shape = [self.tables[0].shape[0], packed_bytes(self.box.shape)]
         arrays = self.container.arrays
@@ -195,8 +245,8 @@ class Card:
         arrays = self.container.arrays
         return arrays[TABLE].name if TABLE in arrays else TABLE
 
-    def _stored(self, name: str, otherwise: str) -> dict[str, Any]:
-        """Path, coding and bytes of an array, or of the arrays below that name."""
+    def _stored(self, name: str, otherwise: str) -> Stored:
+        """The place of an array, or of the arrays below that name."""
         stored = self.container.arrays
         found = [key for key in stored if key == name or key.startswith(f"{name}/")]
         arrays = [stored[key] for key in found]

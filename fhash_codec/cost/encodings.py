@@ -11,7 +11,7 @@ from math import prod
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -303,6 +303,15 @@ class ModelPrice:
     kept: bool
 
 
+class ModelsCompared(TypedDict):
+    """The choice between both models, as JSON values."""
+
+    chosen: Annotated[str, "`compact` or `paper`"]
+    why: Annotated[str, "why"]
+    crop: Annotated[str, "the part of the series that both were fitted to; empty without a choice"]
+    prices: Annotated[list[dict[str, Any]], list[ModelPrice], "what each costs"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelChoice:
     """The model that was chosen.
@@ -319,7 +328,7 @@ class ModelChoice:
     crop: str
     why: str
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> ModelsCompared:
         """The choice as JSON values."""
         return {
             "chosen": self.config.profile,

@@ -21,6 +21,7 @@ from fhash_codec import native
 from fhash_codec.measure.errors import (
     BulkQuality,
     Errors,
+    StepErrors,
     pointer,
     range_and_sum,
 )
@@ -353,7 +354,7 @@ class Quality:
         ssim_window: sigma and window of the SSIM in vertices, the data range and measured steps.
         psnr_domain, rmse_domain, max_abs_error_domain: over all vertices, with the background as
             the decoded value outside the coreset.
-        per_step: figures over the coreset of each step, see `Errors.per_step`.
+        per_step: figures over the coreset of each step.
         between: at key frames and between them; None if every step is a key frame.
     """
 
@@ -366,7 +367,7 @@ class Quality:
     psnr_domain: float | None
     rmse_domain: float | None
     max_abs_error_domain: float | None
-    per_step: list[dict[str, Any]]
+    per_step: list[StepErrors]
     between: BetweenQuality | None = None
 
     def to_dict(self) -> dict[str, Any]:

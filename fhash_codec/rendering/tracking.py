@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Annotated, TypedDict, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -230,20 +230,34 @@ def _span(feature: Feature, low: float, high: float) -> tuple[float, float]:
     return low if feature.threshold is None else max(feature.threshold, low), high
 
 
-def follow(
-    volume: Volume, tracked: Sequence[Tracked], steps: Sequence[float]
-) -> list[dict[str, Any]]:
-    """Find where each feature is at each step.
+class ExtentOfFeature(TypedDict):
+    """Vertices of a feature in physical coordinates."""
 
-    Returns:
-        For each feature {feature, colour, steps: [{step, time, vertices, centroid, bounds}]}.
-        `vertices` is their number, `centroid` (x, y, z) their mean in physical coordinates,
-        `bounds` ((x, x), (y, y), (z, z)) their first and last positions. The last two are None
-        where the feature has no vertex.
-    """
+    vertices: Annotated[int, "their number"]
+    centroid: Annotated[list[float] | None, "their mean (x, y, z); null without a vertex"]
+    bounds: Annotated[list[list[float]] | None, "first and last position along x, y and z"]
+
+
+class PlaceOfFeature(ExtentOfFeature):
+    """A feature at a step."""
+
+    step: Annotated[float, "the step"]
+    time: Annotated[float, "its physical time"]
+
+
+class Followed(TypedDict):
+    """A feature that was followed."""
+
+    feature: Annotated[str, "as `--feature` takes it"]
+    colour: Annotated[str, "its colour, `#rrggbb` or a name"]
+    steps: Annotated[list[PlaceOfFeature], "where it is at each step"]
+
+
+def follow(volume: Volume, tracked: Sequence[Tracked], steps: Sequence[float]) -> list[Followed]:
+    """Find where each feature is at each step."""
     times = volume.coords["t"].values
     axes = [volume.coords[axis].values for axis in "xyz"]
-    places: list[list[dict[str, Any]]] = [[] for _ in tracked]
+    places: list[list[PlaceOfFeature]] = [[] for _ in tracked]
     for step in steps:
         frame = volume.read(step)
         time = float(np.interp(step, np.arange(len(times)), times))
@@ -256,7 +270,7 @@ def follow(
     ]
 
 
-def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Double]) -> dict[str, Any]:
+def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Double]) -> ExtentOfFeature:
     """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
     indices = np.nonzero(selected)[::-1]
     count = len(indices[0])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,15 +32,15 @@ class Finding:
 
     Attributes:
         name: name of the property.
-        worst: the largest figure that was measured.
+        worst: the largest figure that was measured; in JSON a text where it is not finite.
         limit: the largest figure that is allowed.
         unit: unit of both figures, such as 'values', 'of the bound', 'of the range' or 'dB'.
         under: the settings or engine that gave the figure.
     """
 
     name: str
-    worst: float
-    limit: float
+    worst: Annotated[float, float | str]
+    limit: Annotated[float, float | str]
     unit: str
     under: str = ""
 

@@ -14,7 +14,7 @@ from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -95,6 +95,14 @@ class CaseResult:
         return {**vars(self), "holds": self.holds, "findings": [*map(_json, self.findings)]}
 
 
+class SelftestReport(TypedDict):
+    """The results of many cases, as JSON values."""
+
+    holds: Annotated[bool, "whether everything holds"]
+    cases: Annotated[list[dict[str, Any]], list[CaseResult], "every case that was run"]
+    failures: Annotated[list[str], "one line for each figure that does not hold, and each error"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Summary:
     """The results of many cases, in the order of the catalogue."""
@@ -129,7 +137,7 @@ class Summary:
                     worst[finding.name] = result, finding
         return worst
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> SelftestReport:
         """JSON values."""
         return {
             "holds": self.holds,

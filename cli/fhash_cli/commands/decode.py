@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import click
 
@@ -119,6 +119,37 @@ def _converted(frame: npt.NDArray[Any], kind: np.dtype[Any]) -> npt.NDArray[Any]
     return np.asarray(integers)
 
 
+class ValueStatistics(TypedDict):
+    """Statistics of decoded values."""
+
+    min: Annotated[float | None, "smallest value; null without any"]
+    max: Annotated[float | None, "largest value"]
+    mean: Annotated[float | None, "mean value"]
+    inside_fraction: Annotated[float, "share of the region in the coreset"]
+
+
+class DecodedVariable(ValueStatistics):
+    """A region of a variable."""
+
+    shape: Annotated[Sequence[int], "of the region, (t, z, y, x)"]
+    dtype: Annotated[str, "number type of the values"]
+    steps: Annotated[list[float], "steps, fractional between two of them"]
+    region: Annotated[list[tuple[int, int]], "[first, end) along z, y and x"]
+
+
+class Decoded(DecodedVariable):
+    """A region of the one variable."""
+
+    paths: Annotated[list[str], "files written; empty without `-o`"]
+
+
+class DecodedSeveral(TypedDict):
+    """A region of several variables."""
+
+    paths: Annotated[list[str], "files written; empty without `-o`"]
+    variables: Annotated[dict[str, DecodedVariable], "the variables by name"]
+
+
 class Statistics:
     """Smallest, largest and mean value, and share inside the coreset, of frames added one by one.
 
@@ -149,7 +180,7 @@ class Statistics:
             _, low, high = scan_rows(piece[None], self.mean)
             self.low, self.high = min(self.low, low), max(self.high, high)
 
-    def result(self) -> dict[str, float | None]:
+    def result(self) -> ValueStatistics:
         """JSON values; None where no vertex has a value."""
         defined = self.mean.count > 0
         return {
@@ -442,7 +473,7 @@ class Part:
         frames = selection.frames(volume, statistics := Statistics(), progress)
         return cls(volume=volume, selection=selection, frames=frames, statistics=statistics)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> DecodedVariable:
         """The keys of `--json`, once all frames were decoded."""
         chosen = self.selection
         return {
@@ -454,10 +485,13 @@ class Part:
         }
 
 
-def _result(paths: list[str], parts: Sequence[Part]) -> dict[str, Any]:
+def _result(paths: list[str], parts: Sequence[Part]) -> Decoded | DecodedSeveral:
     if len(parts) == 1:
         return {"paths": paths, **parts[0].result()}
-    return {"paths": paths, "variables": {part.volume.variable: part.result() for part in parts}}
+    return {
+        "paths": paths,
+        "variables": {str(part.volume.variable): part.result() for part in parts},
+    }
 
 
 def _say_why_floats(part: Part) -> None:
