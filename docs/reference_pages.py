@@ -24,7 +24,7 @@ from fhash_codec.simulation.scene import EFFECTS
 Schema = dict[str, Any]
 
 RESULTS = {
-    "encode": "fhash_codec.comparison.Report fhash_cli.commands.encode.Chosen",
+    "encode": "fhash_codec.comparison.EncodeReport fhash_cli.commands.encode.Chosen",
     "encode --var u,v": "fhash_codec.encoding.DatasetReport",
     "plan": "fhash_cli.commands.parts.PlanReport",
     "merge": "fhash_codec.appending.parts.MergeReport",
@@ -99,12 +99,18 @@ TYPES[type(None)] = "null"
 
 def schemas() -> dict[str, Schema]:
     """Schemas of draft 2020-12, by command or name of settings."""
-    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    found = {name: _object(*_records(records)) for name, records in RESULTS.items()}
-    for name in MISSED:
-        found[name]["properties"] |= found["errors"]["properties"]
-    found |= {name: _settings(*_records(record)) for name, record in SETTINGS.items()}
-    return {name: dialect | schema for name, schema in found.items()}
+    return {name: schema_of(name) for name in (*RESULTS, *SETTINGS)}
+
+
+def schema_of(name: str) -> Schema:
+    """The schema of what a command prints, or of settings."""
+    if name in SETTINGS:
+        found = _settings(*_records(SETTINGS[name]))
+    else:
+        found = _object(*_records(RESULTS[name]))
+    if name in MISSED:
+        found["properties"] |= schema_of("errors")["properties"]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **found}
 
 
 def keys(schema: Schema, place: str = "") -> Iterator[tuple[str, Schema]]:
@@ -243,8 +249,9 @@ def _schema(hint: Any) -> Schema:
     """
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        *stand_in, text = inner[1:]
-        return _schema((stand_in or inner)[0]) | {"description": text}
+        others = [each for each in inner[1:] if not isinstance(each, str)]
+        told = {"description": inner[-1]} if isinstance(inner[-1], str) else {}
+        return _schema((others or inner)[0]) | told
     if origin is Literal:
         return {"enum": list(inner)} if len(inner) > 1 else {"const": inner[0]}
     if origin in (types.UnionType, typing.Union):
@@ -323,8 +330,7 @@ def _bounded(schema: Schema, told: Mapping[str, Any]) -> Schema:
 
 
 if __name__ == "__main__":
-    made = schemas()
     if sys.argv[1:]:
-        print(json.dumps(made[" ".join(sys.argv[1:])], indent=2))
+        print(json.dumps(schema_of(" ".join(sys.argv[1:])), indent=2))
     else:
-        print("\n\n".join(f"## `{name}`\n\n{markdown(each)}" for name, each in made.items()))
+        print("\n\n".join(f"## `{name}`\n\n{markdown(it)}" for name, it in schemas().items()))

@@ -82,6 +82,11 @@ class Report(Sizes):
     ]
     gains: Annotated[list[Gain], "what the search of the profile compact went through"]
     quality: Annotated[dict[str, Any], Quality, "all figures of the quality"]
+
+
+class EncodeReport(Report):
+    """Figures of a file that was encoded."""
+
     stages: NotRequired[
         Annotated[
             list[dict[str, Any]],

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fhash_codec.compact.encode import DecodedTiles, code_series, encode_compact
 from fhash_codec.compact.goal import missed_promise, remarks
 from fhash_codec.compact.tiles import fits_memory
-from fhash_codec.comparison import Report, Sizes, measure, report, ssim_budget, steps_of_ssim
+from fhash_codec.comparison import EncodeReport, Sizes, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import AUTO, EncodeConfig
 from fhash_codec.dataset import Dataset
 from fhash_codec.devices import choose_device
@@ -58,7 +58,7 @@ def encode(
     progress: Progress = silent,
     predicted: Mapping[str, Any] | None = None,
     client: Any = None,
-) -> Report:
+) -> EncodeReport:
     """Encode a series into the container `path`, complete or not at all.
 
     source: a file (opened by `open_series` of `readers`), a Series, or an array (t, z, y, x) or
@@ -105,8 +105,8 @@ def encode(
         encoded.remove_checkpoint()
     with open_volume(written) as volume:
         seconds = time.perf_counter() - begun
-        figures = report(volume, encoded.quality, seconds=seconds, files=series.files)
-    figures["stages"] = clock.to_list()
+        told = report(volume, encoded.quality, seconds=seconds, files=series.files)
+    figures: EncodeReport = {**told, "stages": clock.to_list()}
     if encoded.missed is not None:
         raise QualityError(missed_text(path, written, encoded.missed, encoded.advice), figures)
     for remark in remarks(config, figures):
@@ -122,7 +122,7 @@ def _on_cluster(
     mask: npt.ArrayLike | None,
     force: bool,
     progress: Progress,
-) -> Report:
+) -> EncodeReport:
     """Encode on a cluster; raises InputError for a mask, which only this process has."""
     from fhash_codec.appending.cluster import encode_on_cluster
 
@@ -371,7 +371,7 @@ class DatasetReport(Sizes):
     The `bytes` of a variable are those of its own arrays, without shared coordinates and header.
     """
 
-    variables: Annotated[dict[str, Report], "figures of each variable by name"]
+    variables: Annotated[dict[str, EncodeReport], "figures of each variable by name"]
 
 
 def encode_dataset(
@@ -579,12 +579,12 @@ def _report(
     seconds: float,
 ) -> DatasetReport:
     """The figures of a written file and of each variable."""
-    figures = {}
+    figures: dict[str, EncodeReport] = {}
     with Dataset(Container.open(path)) as dataset:
         for name, volume in dataset.items():
             took = sum(stage["seconds"] for stage in stages[name])
-            figures[name] = report(volume, encoded[name].quality, seconds=took)
-            figures[name]["stages"] = stages[name]
+            told = report(volume, encoded[name].quality, seconds=took)
+            figures[name] = {**told, "stages": stages[name]}
         size, split = dataset.container.size, dataset.container.split()
     raw = sum(each["raw_bytes"] for each in figures.values())
     return {

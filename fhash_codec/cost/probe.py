@@ -39,7 +39,7 @@ from fhash_codec.compact.stages import first_guess, first_settings
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, code, total
 from fhash_codec.compact.transform import likely_transform, tile_costs, usual_transform
-from fhash_codec.comparison import Report
+from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
 from fhash_codec.features.bricks import BRICK_BITS
@@ -503,13 +503,13 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     )
 
 
-def _encoded(part: Series, config: EncodeConfig) -> Report:
+def _encoded(part: Series, config: EncodeConfig) -> EncodeReport:
     """The report of an encoding into a file that is thrown away."""
     with TemporaryDirectory() as folder:
         return reported(part, Path(folder) / "part.fhz", config)[0]
 
 
-def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[Report, bool]:
+def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[EncodeReport, bool]:
     """The report of an encoding, without warnings, and whether it keeps its promise."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FhashWarning)

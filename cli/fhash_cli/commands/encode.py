@@ -49,7 +49,7 @@ from fhash_cli.variables import config_of, configs_of, report_table, variables_t
 from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
-    from fhash_codec.comparison import Report
+    from fhash_codec.comparison import EncodeReport
     from fhash_codec.config import EncodeConfig
     from fhash_codec.cost.encodings import ModelChoice, ModelsCompared
     from fhash_codec.cost.prediction import Choice, TimeBudget
@@ -202,7 +202,7 @@ def command(
     return emit({**report, **chosen}, text, as_json, missed or stopped)
 
 
-def _explained(figures: Report, explain: bool, title: str = "") -> str:
+def _explained(figures: EncodeReport, explain: bool, title: str = "") -> str:
     """The table of the stages of a report, which keeps them only where they are asked for."""
     stages = figures.pop("stages", [])
     if not explain:
@@ -385,7 +385,7 @@ def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
 
 def _write_report(
     series: Series,
-    figures: Report,
+    figures: EncodeReport,
     config: EncodeConfig,
     folder: Path,
     force: bool,
@@ -428,7 +428,9 @@ def _after_interruption(output: str, before: tuple[int, int] | None) -> str:
     return f"interrupted; {left}, and the same command {again}"
 
 
-def report_rows(report: Report, units: str, *, part: bool, verbose: bool) -> list[tuple[str, str]]:
+def report_rows(
+    report: EncodeReport, units: str, *, part: bool, verbose: bool
+) -> list[tuple[str, str]]:
     """An encoding's report as a table.
 
     part: whether options chose a part of the source.

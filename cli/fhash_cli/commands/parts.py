@@ -22,7 +22,7 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 from fhash_cli.variables import config_of
 
 if TYPE_CHECKING:
-    from fhash_codec.comparison import Report
+    from fhash_codec.comparison import EncodeReport
     from fhash_codec.config import EncodeConfig
     from fhash_formats.series import Series
 
@@ -154,7 +154,7 @@ def encode_all_or_part(
     force: bool,
     progress: Progress,
     predicted: dict[str, Any] | None,
-) -> Report:
+) -> EncodeReport:
     """Encode a series, or one part of it."""
     import fhash_codec
     from fhash_codec.appending.parts import Part, encode_part
@@ -168,7 +168,7 @@ def encode_all_or_part(
     if part.plan is not None:
         plan = SeriesPlan.read(part.plan)
         plan.require_settings(_given(config))
-    return encode_part(
+    report = encode_part(
         series,
         output,
         config if plan is None else None,
@@ -177,6 +177,7 @@ def encode_all_or_part(
         force=force,
         progress=progress,
     )
+    return {**report, "stages": []}
 
 
 def _given(config: EncodeConfig) -> dict[str, Any]:
