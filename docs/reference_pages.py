@@ -93,8 +93,10 @@ fhash_formats.container.reader.Split fhash_formats.readers.listing.ListedVariabl
 fhash_formats.series.NotStoredValues
 """
 """Records whose names the modules of commands know only to mypy, so that they start fast."""
-TYPES = {str: "string", Path: "string", int: "integer", float: "number", bool: "boolean"}
-TYPES[type(None)] = "null"
+TYPES = {
+    **{bool: "boolean", int: "integer", float: "number"},
+    **{str: "string", Path: "string", types.NoneType: "null"},
+}
 
 
 def schemas() -> dict[str, Schema]:
@@ -119,7 +121,7 @@ def keys(schema: Schema, place: str = "") -> Iterator[tuple[str, Schema]]:
     Inside a record that is the result of a command, too, they are left out.
     """
     results = {records.split()[0].rpartition(".")[2] for records in RESULTS.values()}
-    for option in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
+    for option in schema.get("anyOf", ()):
         yield from keys(option, place)
     if "items" in schema:
         yield from keys(schema["items"], f"{place}[]")
@@ -136,31 +138,35 @@ def markdown(schema: Schema) -> str:
     """The description of a schema, and a table of its keys."""
     head = [schema["description"], "", "| key | type | meaning |", "|---|---|---|"]
     rows = [f"| `{key}` | {_words(inner)} | {_meaning(inner)} |" for key, inner in keys(schema)]
-    return "\n".join([*head, *dict.fromkeys(rows)])
+    effects = schema["properties"].get("effects", {}).get("items", {}).get("oneOf", ())
+    names = [each["properties"]["effect"]["const"] for each in effects]
+    more = [
+        f"\n### `{name}`\n\n{markdown(each)}" for name, each in zip(names, effects, strict=True)
+    ]
+    return "\n".join([*head, *rows, *more])
 
 
 def _words(schema: Schema, many: str = "") -> str:
     """The type of a schema in words, such as `list of integers or null`."""
     if "anyOf" in schema:
         return " or ".join(dict.fromkeys(_words(each, many) for each in schema["anyOf"]))
-    if "oneOf" in schema:
-        return f"object{many}"
+    if schema.get("enum") == [None, False]:
+        return "null"
     if "enum" in schema or "const" in schema:
-        listed = schema.get("enum", [schema.get("const")])
-        return " or ".join(
-            f"`{each if isinstance(each, str) else json.dumps(each)}`" for each in listed
-        )
+        values = schema.get("enum", [schema.get("const")])
+        texts = [each if isinstance(each, str) else json.dumps(each) for each in values]
+        return " or ".join(f"`{text}`" for text in texts)
+    kinds = schema.get("type", "object" if "oneOf" in schema else "any value")
     words = []
-    for kind in schema["type"] if isinstance(schema.get("type"), list) else [schema.get("type")]:
+    for kind in kinds if isinstance(kinds, list) else [kinds]:
         rest = schema.get("additionalProperties")
         if kind == "array":
-            words.append(f"list{many} of {_words(schema['items'], 's')}")
+            inner = _words(schema["items"], "s")
+            words.append(f"list{many} of {f'({inner})' if ' or ' in inner else inner}")
+        elif kind == "object" and rest:
+            words.append(f"object{many} of {_words(rest, 's')}")
         elif kind == "object":
-            free = rest == {} or ("properties" not in schema and not rest)
-            inner = f" of {_words(rest, 's')}" if rest else ""
-            words.append(f"{'free ' * free}object{many}{inner}")
-        elif kind is None:
-            words.append("any value" + many)
+            words.append(f"{'free ' * (rest == {})}object{many}")
         else:
             words.append({"string": "text", "null": "null"}.get(kind, kind + many))
     return " or ".join(words)
@@ -195,8 +201,7 @@ def _object(*records: Any) -> Schema:
         hints = typing.get_type_hints(record, localns=names, include_extras=True)
         for name in ALSO.get(record.__name__, ()):
             also = getattr(record, name)
-            also = also.fget if isinstance(also, property) else also
-            hints[name] = typing.get_type_hints(also)["return"]
+            hints[name] = typing.get_type_hints(getattr(also, "fget", also))["return"]
             text = also.__doc__.partition("\n")[0].rstrip(".").replace("None", "null")
             told[name] = text[0].lower() + text[1:]
         for name, hint in hints.items():
@@ -232,14 +237,9 @@ def _attributes(record: Any) -> dict[str, str]:
     """What the docstring of a class says of its attributes, `name, other: text`, by name."""
     text = " ".join(record.__doc__.partition("Attributes:")[2].split()).replace("None", "null")
     names = "|".join(record.__annotations__)
-    listed, texts = [], []
     _, *parts = re.split(rf"(?:^|(?<=\. ))((?:(?:{names}), )*(?:{names})): ", text)
-    listed, texts = parts[::2], parts[1::2]
-    return {
-        name: told.strip().rstrip(".")
-        for several, told in zip(listed, texts, strict=True)
-        for name in several.split(", ")
-    }
+    told = zip(parts[::2], parts[1::2], strict=True)
+    return {name: each.strip(" .") for several, each in told for name in several.split(", ")}
 
 
 def _schema(hint: Any) -> Schema:
@@ -323,9 +323,8 @@ def _bounded(schema: Schema, told: Mapping[str, Any]) -> Schema:
         found["enum"] = list(told["choices"])
     if "null" in kinds:
         # TOML has no null: false stands for it.
-        others = [kind for kind in kinds if kind != "null"]
-        options = [{**found, "type": others[0]}] if others else []
-        return {"anyOf": [*options, {"enum": [None, False]}]}
+        others = [{**found, "type": kind} for kind in kinds if kind != "null"]
+        return {"anyOf": [*others, {"enum": [None, False]}]}
     return found
 
 

@@ -54,18 +54,12 @@ class Report(Sizes):
 
     source_bytes: Annotated[int | None, "size on disk of the files read; null without files"]
     source_ratio: Annotated[float | None, "`source_bytes / bytes`"]
-    psnr: Annotated[
-        float | None, "dB over the coreset of all steps; null if the error or the range is 0"
-    ]
-    psnr_bulk: Annotated[
-        float | None, "dB over the values in the range of the middle 98 %, relative to that range"
-    ]
+    psnr: Annotated[float | None, "dB over the coreset; null if error or range is 0"]
+    psnr_bulk: Annotated[float | None, "dB within, and relative to, the middle 98 %"]
     rmse: Annotated[float | None, "root of the mean squared error in the coreset, in data units"]
     max_abs_error: Annotated[float | None, "largest error in the coreset, in data units"]
     ssim: Annotated[float | None, "mean structural similarity over the coreset"]
-    psnr_domain: Annotated[
-        float | None, "dB over every finite vertex, with the background outside the coreset"
-    ]
+    psnr_domain: Annotated[float | None, "dB over all, background outside the coreset"]
     epochs: Annotated[int, "of the training; of the head in the profile compact, 0 without one"]
     curve: Annotated[list[HistoryPoint], "course of the training"]
     shape: Annotated[list[int], "of the series, (t, z, y, x)"]
@@ -77,9 +71,7 @@ class Report(Sizes):
     profile: Annotated[Literal["compact", "paper"], "the model"]
     tables_loss_db: Annotated[float | None, "dB that coded tables lose at the key frames"]
     device: Annotated[Literal["cpu", "cuda"], "where it was trained"]
-    restarts: Annotated[
-        int, "times that the training diverged and began again at a quarter of the learning rate"
-    ]
+    restarts: Annotated[int, "times that the training diverged and began again, slower"]
     gains: Annotated[list[Gain], "what the search of the profile compact went through"]
     quality: Annotated[dict[str, Any], Quality, "all figures of the quality"]
 
@@ -87,13 +79,7 @@ class Report(Sizes):
 class EncodeReport(Report):
     """Figures of a file that was encoded."""
 
-    stages: NotRequired[
-        Annotated[
-            list[dict[str, Any]],
-            list[Stage],
-            "`--explain`: stages of the encoding in their order, and `other` for the rest",
-        ]
-    ]
+    stages: NotRequired[Annotated[list[dict[str, Any]], list[Stage], "`--explain`"]]
 
 
 class Compared(Report):

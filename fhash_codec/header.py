@@ -620,9 +620,7 @@ class FileQuality(TypedDict, total=False):
     rmse_domain: Annotated[float | None, "over every finite vertex"]
     max_abs_error_domain: Annotated[float | None, "over every finite vertex"]
     between: Annotated[dict[str, float | None], BetweenQuality, "at key frames and between them"]
-    per_step: Annotated[
-        list[StepErrors], "figures of each step; neighbours of a long series may share theirs"
-    ]
+    per_step: Annotated[list[StepErrors], "of each step, or of some neighbours together"]
 
 
 class Variable(TypedDict):
@@ -633,9 +631,7 @@ class Variable(TypedDict):
     dtype: Annotated[str, "number type of the source"]
     attributes: Annotated[dict[str, Any], "attributes of the source"]
     fill: NotRequired[Annotated[float, "what stood in the source for a missing value, if any did"]]
-    not_stored: NotRequired[
-        Annotated[NotStoredValues, "values that nobody wrote and that are numbers here, if any"]
-    ]
+    not_stored: NotRequired[Annotated[NotStoredValues, "values that nobody wrote"]]
 
 
 class Domain(TypedDict):
@@ -656,6 +652,7 @@ class FileInfo(TypedDict):
     """The header of a file, and what follows from it."""
 
     path: Annotated[str, "the file"]
+    name: NotRequired[Annotated[str, "of a variable among several"]]
     bytes: Annotated[int, "its size"]
     split: Annotated[dict[str, int], Split, "`bytes` by what they hold; they add up to it"]
     overhead_bytes: Annotated[int, "bytes of it that are no values"]
@@ -665,14 +662,10 @@ class FileInfo(TypedDict):
     format_version: Annotated[list[int], "major and minor"]
     required_features: Annotated[list[str], "what a reader must know"]
     encoder: Annotated[
-        dict[str, Any],
-        "version of fhash, and seed; with `--time-budget` what was predicted, and `took_seconds`;"
-        " `command` and `codec` in a file of `fhash pack`",
+        dict[str, Any], "version and seed; what was predicted; of `fhash pack`, the codec"
     ]
     variable: Annotated[Variable, "what the values are"]
-    source: NotRequired[
-        Annotated[dict[str, Any], "what belongs to the variable in its source, see FORMAT.md"]
-    ]
+    source: NotRequired[Annotated[dict[str, Any], "what belongs to the variable"]]
     domain: Annotated[Domain, "the lattice"]
     coordinates: Annotated[dict[str, Any], "coordinates that need no array"]
     value_range: Annotated[list[float], "smallest and largest value"]
@@ -682,13 +675,9 @@ class FileInfo(TypedDict):
     feature_bounding_box: Annotated[list[list[int]], "[first, end) along z, y and x"]
     coreset_fraction: Annotated[float, "share of the domain that is kept, 0 to 1"]
     key_frames: Annotated[list[int], "steps that were encoded"]
-    model: Annotated[
-        dict[str, Any], "the model; its `tiling` says what the tiles cost, see FORMAT.md, The model"
-    ]
+    model: Annotated[dict[str, Any], "the model, see FORMAT.md, The model"]
     config: Annotated[dict[str, Any], "every setting that the file was made with"]
-    training: Annotated[
-        dict[str, Any], "seconds, steps, epochs, device, engine and threads of what was trained"
-    ]
+    training: Annotated[dict[str, Any], "seconds, epochs, device and more"]
     history: Annotated[list[HistoryPoint], "course of the training"]
     quality: Annotated[FileQuality, "figures of the quality"]
     array: NotRequired[Annotated[str, "path of the array of the values, where one shows them"]]

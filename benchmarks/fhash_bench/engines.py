@@ -288,31 +288,19 @@ class EngineFigures(TypedDict):
     path: Annotated[str | None, "instructions that the native engine used; null for the others"]
     train_msamples_s: Annotated[float, "training, 10^6 samples a second that passed"]
     train_msamples_cpu_s: Annotated[float, "the same, a second of processors"]
-    train_ratio: Annotated[
-        float | None, "times that of `slab` in as many threads, by seconds of processors, if known"
-    ]
+    train_ratio: Annotated[float | None, "times that of `slab` in as many threads"]
     infer_msamples_s: Annotated[float, "evaluation, 10^6 samples a second that passed"]
     infer_msamples_cpu_s: Annotated[float, "the same, a second of processors"]
     infer_ratio: Annotated[float | None, "times that of `slab`"]
-    thread_ratio: Annotated[
-        float | None, "training a second that passed, over that of one thread; null for one"
-    ]
-    fraction_of_peak: Annotated[
-        float, "arithmetic of the network in training (three products) over the instructions' peak"
-    ]
-    infer_fraction_of_peak: Annotated[float, "the same in evaluation (one product)"]
-    fraction_of_bandwidth: Annotated[
-        float,
-        "bytes that training moves at least (target, finest embeddings and their two moments) over"
-        " the rate of a copy",
-    ]
+    thread_ratio: Annotated[float | None, "training, over that of one thread"]
+    fraction_of_peak: Annotated[float, "three products of the network over the peak"]
+    infer_fraction_of_peak: Annotated[float, "one product, in evaluation"]
+    fraction_of_bandwidth: Annotated[float, "bytes that training moves at least, over a copy"]
     psnr: Annotated[float | None, "dB on some bricks of the coreset; null for an exact model"]
     epochs: Annotated[float, "that it reached"]
     seconds: Annotated[float, "of training that passed"]
     cpu_seconds: Annotated[float, "of training, of processors"]
-    seconds_to: Annotated[
-        list[Reached], "when it first reached a quality, at a rate that falls to 0 over its seconds"
-    ]
+    seconds_to: Annotated[list[Reached], "when it first reached a quality"]
     curve: Annotated[list[dict[str, Any]], list[CurvePoint], "its quality after each turn"]
 
 

@@ -209,9 +209,7 @@ class TrainSeries(DecodeRate):
     batch_samples: Annotated[float, "samples of a batch, the mean"]
     batch_bricks: Annotated[float, "bricks of a batch, the mean"]
     brick_fill: Annotated[float, "share of samples among the vertices of bricks, 0 to 1"]
-    engines: Annotated[
-        list[dict[str, Any]], list[EngineFigures], "figures of each engine, medians over the turns"
-    ]
+    engines: Annotated[list[dict[str, Any]], list[EngineFigures], "each engine"]
     points: Annotated[list[PointRate], "queries at points of one time, the tables read included"]
 
 
@@ -223,14 +221,8 @@ class TrainBench(TypedDict):
     """
 
     machine: Annotated[dict[str, Any], "device, processor, cores, threads, torch"]
-    peaks: Annotated[
-        list[dict[str, Any]],
-        list[Peak],
-        "what the machine can do in one thread, measured between the engines",
-    ]
-    series: Annotated[
-        list[TrainSeries], "the series with its features, and whole, for each number of bricks"
-    ]
+    peaks: Annotated[list[dict[str, Any]], list[Peak], "of one thread"]
+    series: Annotated[list[TrainSeries], "with features and whole, for each number of bricks"]
 
 
 def bench_train(

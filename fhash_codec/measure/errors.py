@@ -270,17 +270,11 @@ class StepErrors(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class BulkQuality:
-    """Figures over the counted vertices whose original value lies in the bulk of the series.
+    """Figures over the counted vertices whose original value lies in the bulk of the series."""
 
-    Attributes:
-        psnr: in dB, relative to the width of the bulk; None if the error is 0.
-        rmse: in data units; None if no such vertex is counted.
-        range: first and last value of the bulk, in data units.
-    """
-
-    psnr: float | None
-    rmse: float | None
-    range: tuple[float, float]
+    psnr: Annotated[float | None, "dB, relative to the width of the bulk; null if the error is 0"]
+    rmse: Annotated[float | None, "in data units; null if no such vertex is counted"]
+    range: Annotated[tuple[float, float], "first and last value of the bulk, in data units"]
 
 
 class Errors:

@@ -230,19 +230,14 @@ def _span(feature: Feature, low: float, high: float) -> tuple[float, float]:
     return low if feature.threshold is None else max(feature.threshold, low), high
 
 
-class ExtentOfFeature(TypedDict):
-    """Vertices of a feature in physical coordinates."""
-
-    vertices: Annotated[int, "their number"]
-    centroid: Annotated[list[float] | None, "their mean (x, y, z); null without a vertex"]
-    bounds: Annotated[list[list[float]] | None, "first and last position along x, y and z"]
-
-
-class PlaceOfFeature(ExtentOfFeature):
-    """A feature at a step."""
+class PlaceOfFeature(TypedDict):
+    """A feature at a step, in physical coordinates."""
 
     step: Annotated[float, "the step"]
     time: Annotated[float, "its physical time"]
+    vertices: Annotated[int, "their number"]
+    centroid: Annotated[list[float] | None, "their mean (x, y, z); null without a vertex"]
+    bounds: Annotated[list[list[float]] | None, "first and last position along x, y and z"]
 
 
 class Followed(TypedDict):
@@ -263,22 +258,24 @@ def follow(volume: Volume, tracked: Sequence[Tracked], steps: Sequence[float]) -
         time = float(np.interp(step, np.arange(len(times)), times))
         for item, items_places in zip(tracked, places, strict=True):
             selected = np.asarray(item.feature.select(frame, int(step)))
-            items_places.append({"step": float(step), "time": time, **_extent(selected, axes)})
+            items_places.append(_place(float(step), time, selected, axes))
     return [
         {"feature": str(item.feature), "colour": item.colour, "steps": items_places}
         for item, items_places in zip(tracked, places, strict=True)
     ]
 
 
-def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Double]) -> ExtentOfFeature:
-    """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
+def _place(
+    step: float, time: float, selected: npt.NDArray[np.bool_], axes: Sequence[Double]
+) -> PlaceOfFeature:
+    """The place of the selected vertices (z, y, x) at coordinates x, y, z."""
     indices = np.nonzero(selected)[::-1]
     count = len(indices[0])
-    if not count:
-        return {"vertices": 0, "centroid": None, "bounds": None}
     positions = [axis[index] for axis, index in zip(axes, indices, strict=True)]
     return {
+        "step": step,
+        "time": time,
         "vertices": count,
-        "centroid": [float(axis.mean()) for axis in positions],
-        "bounds": [[float(axis.min()), float(axis.max())] for axis in positions],
+        "centroid": [float(axis.mean()) for axis in positions] if count else None,
+        "bounds": [[float(axis.min()), float(axis.max())] for axis in positions] if count else None,
     }

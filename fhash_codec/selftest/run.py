@@ -49,23 +49,14 @@ def relative(finding: Finding) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseResult:
-    """The results of one case.
+    """The results of one case."""
 
-    Attributes:
-        name: name of the case.
-        group: its group.
-        about: one line that says what is hard.
-        under: names of the settings that were tried.
-        findings: the findings under all settings, each with the name of its settings in `under`.
-        errors: one line for each error that kept the case, or a check of it, from finishing.
-    """
-
-    name: str
-    group: str
-    about: str
-    under: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    errors: tuple[str, ...] = ()
+    name: Annotated[str, "name of the case"]
+    group: Annotated[str, "its group"]
+    about: Annotated[str, "one line that says what is hard"]
+    under: Annotated[tuple[str, ...], "names of the settings that were tried"] = ()
+    findings: Annotated[tuple[Finding, ...], "its figures under all settings"] = ()
+    errors: Annotated[tuple[str, ...], "what kept it from finishing"] = ()
 
     @property
     def holds(self) -> bool:

@@ -431,9 +431,7 @@ class Counts(TypedDict):
     places: Annotated[int, "places looked at for them, those beside blocks of vertices included"]
     parts: Annotated[int, "parts of the time over all frames, in each of which every flow acts"]
     stretches: Annotated[int, "vertices at which the change to the next was computed"]
-    effects: Annotated[
-        dict[str, EffectCounts], "each kind of effect, also those that the scene does not name"
-    ]
+    effects: Annotated[dict[str, EffectCounts], "each kind of effect, used or not"]
 
 
 def counts(simulation: Simulation) -> Counts:

@@ -298,11 +298,7 @@ class PackedVariable(TypedDict):
     bytes: Annotated[int, "all chunks, coded"]
     raw_bytes: Annotated[int, "the values in their own type"]
     value_range: Annotated[list[float], "smallest and largest value"]
-    codec: Annotated[
-        dict[str, Any],
-        "the quality asked of each chunk: `max_error`, `max_error_rel` or `step`; empty where it is"
-        " not known",
-    ]
+    codec: Annotated[dict[str, Any], "`max_error`, `max_error_rel` or `step`, if known"]
 
 
 class PackReport(TypedDict):

@@ -219,9 +219,7 @@ class Parameters(TypedDict):
 class PaperReport(TypedDict):
     """The paper's tables, quoted figures beside ours."""
 
-    cells: Annotated[
-        list[dict[str, Any]], "each training, as in its file: settings, sizes, curve, machine"
-    ]
+    cells: Annotated[list[dict[str, Any]], "each training, as in its file"]
     tables: Annotated[list[TableReport], "the tables, and the paper's claims"]
     notes: Annotated[list[str], "what was not measured, and why"]
     files: Annotated[list[str], "tables and curves that were written"]

@@ -71,8 +71,7 @@ class TableReport(TypedDict):
     title: Annotated[str, "one line"]
     rows: Annotated[
         list[dict[str, Any]],
-        "values by heading; a figure over seeds is an object with `median`, `low`, `high` and"
-        ' `seeds`; `"NR"` stands for what was not reached',
+        'by heading; `{median, low, high, seeds}` over seeds; `"NR"` where not reached',
     ]
     notes: Annotated[list[str], "what to know about the table"]
 

@@ -119,22 +119,17 @@ def _converted(frame: npt.NDArray[Any], kind: np.dtype[Any]) -> npt.NDArray[Any]
     return np.asarray(integers)
 
 
-class ValueStatistics(TypedDict):
-    """Statistics of decoded values."""
-
-    min: Annotated[float | None, "smallest value; null without any"]
-    max: Annotated[float | None, "largest value"]
-    mean: Annotated[float | None, "mean value"]
-    inside_fraction: Annotated[float, "share of the region in the coreset"]
-
-
-class DecodedVariable(ValueStatistics):
+class DecodedVariable(TypedDict):
     """A region of a variable."""
 
     shape: Annotated[Sequence[int], "of the region, (t, z, y, x)"]
     dtype: Annotated[str, "number type of the values"]
     steps: Annotated[list[float], "steps, fractional between two of them"]
     region: Annotated[list[tuple[int, int]], "[first, end) along z, y and x"]
+    min: Annotated[float | None, "smallest value; null without any"]
+    max: Annotated[float | None, "largest value"]
+    mean: Annotated[float | None, "mean value"]
+    inside_fraction: Annotated[float, "share of the region in the coreset"]
 
 
 class Decoded(DecodedVariable):
@@ -179,16 +174,6 @@ class Statistics:
         for piece in pieces(frame if integers is None else integers[~np.isnan(frame)]):
             _, low, high = scan_rows(piece[None], self.mean)
             self.low, self.high = min(self.low, low), max(self.high, high)
-
-    def result(self) -> ValueStatistics:
-        """JSON values; None where no vertex has a value."""
-        defined = self.mean.count > 0
-        return {
-            "min": self.low if defined else None,
-            "max": self.high if defined else None,
-            "mean": self.mean.value() if defined else None,
-            "inside_fraction": self.inside / self.all,
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -475,13 +460,17 @@ class Part:
 
     def result(self) -> DecodedVariable:
         """The keys of `--json`, once all frames were decoded."""
-        chosen = self.selection
+        chosen, found = self.selection, self.statistics
+        defined = found.mean.count > 0
         return {
             "shape": chosen.shape,
             "dtype": chosen.kind.name,
             "steps": chosen.steps,
             "region": [(vertices.start, vertices.stop) for vertices in chosen.vertices],
-            **self.statistics.result(),
+            "min": found.low if defined else None,
+            "max": found.high if defined else None,
+            "mean": found.mean.value() if defined else None,
+            "inside_fraction": found.inside / found.all,
         }
 
 

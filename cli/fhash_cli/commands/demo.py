@@ -205,9 +205,7 @@ class Simulated(TypedDict):
     shape: Annotated[list[int], "of the series, (t, z, y, x)"]
     simulate_seconds: Annotated[float, "of the simulation, writing included"]
     counters: Annotated[Counts, "what the simulation took"]
-    explain: NotRequired[
-        Annotated[list[list[str]], "`--explain`: topic, and what was computed and why"]
-    ]
+    explain: NotRequired[Annotated[list[list[str]], "`--explain`: topic and reason"]]
 
 
 class SimulatedFile(Simulated):

@@ -258,9 +258,7 @@ class DataInfo(TypedDict):
     path: Annotated[str, "as given"]
     files: Annotated[int, "files of a pattern; 1 without one"]
     variables: Annotated[list[ListedVariable], "what can be encoded and what cannot"]
-    series: NotRequired[
-        Annotated[SeriesDetails, "what `--var` and `--t` choose, where it is one series"]
-    ]
+    series: NotRequired[Annotated[SeriesDetails, "the series that `--var`, `--t` choose"]]
 
 
 class DatasetInfo(TypedDict):

@@ -35,9 +35,7 @@ class ListedDimension(TypedDict):
 
     name: Annotated[str, "its name, or `dim0` and so on"]
     length: Annotated[int, "its length"]
-    axis: Annotated[
-        str, "`t`, `z`, `y`, `x`, `select` (an index is to be selected) or `?` (two readings)"
-    ]
+    axis: Annotated[str, "`t`, `z`, `y`, `x`, `select` (one index) or `?` (unclear)"]
 
 
 class ListedVariable(TypedDict):
@@ -47,9 +45,7 @@ class ListedVariable(TypedDict):
     shape: Annotated[list[int], "lengths in the order of the file"]
     dtype: Annotated[str, "type of the values"]
     stored: Annotated[str, "type of packed numbers; empty where nothing is packed"]
-    missing: Annotated[
-        list[float | str], "what stands for a missing value; text where it is not finite"
-    ]
+    missing: Annotated[list[float | str], "missing values; text if not finite"]
     units: Annotated[str, "may be empty"]
     dimensions: Annotated[list[ListedDimension], "in the order of the file"]
     commands: Annotated[list[str], "the command that encodes it, one for each likely reading"]
