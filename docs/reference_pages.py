@@ -118,9 +118,10 @@ def schema_of(name: str) -> Schema:
 def keys(schema: Schema, place: str = "") -> Iterator[tuple[str, Schema]]:
     """Every key below a schema, with its own: `a.b`, `a[].b` in a list, `a.*` for any key.
 
-    Inside a record that is the result of a command, too, they are left out.
+    Those of a record within that has a table of its own are left out.
     """
     results = {records.split()[0].rpartition(".")[2] for records in RESULTS.values()}
+    results.add("FileInfo")  # `fhash info` tells all of it, and more
     for option in schema.get("anyOf", ()):
         yield from keys(option, place)
     if "items" in schema:

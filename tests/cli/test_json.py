@@ -112,6 +112,15 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     fhash(*words, "-q")
     outputs["info"].append(parsed(fhash("info", path, "--json")))
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
+    with h5py.File(partly, "w") as file, h5py.File(data) as whole:
+        file["u"] = np.stack(2 * [whole["density"][...]])
+    words = ["encode", partly, "-o", path, "--components", "dim0", "--effort", "1", "--force"]
+    check("encode --var u,v", parsed(fhash(*words, "--json", "-q")))
+    check("info of several variables", parsed(fhash("info", path, "--json")))
+    outputs["info"].append(parsed(fhash("info", path, "--var", "u_1", "--json")))
+    part = ["--max-error", "0.1", "--tile", "2x6x7x8", "--effort", "1", "--part", "1/2"]
+    parsed(fhash("encode", data, "-o", path, "--force", *part, "--json", "-q"))
+    outputs["info"].append(parsed(fhash("info", path, "--json")))
     for command, results in outputs.items():
         check(command, *results)
     for report in (*outputs["encode"], *outputs["info"]):
@@ -134,6 +143,10 @@ def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     demo["quality"]["between"] = vars(example(BetweenQuality))
     check("demo", demo)
     check("demo -o FILE", parsed(fhash(*words, tmp_path / "run.npy")))
+    monkeypatch.setattr("fhash_codec.gallery.PICTURES", ())
+    monkeypatch.setattr("fhash_codec.gallery.GALLERY_SERIES", {})
+    gallery = fhash("demo", "--gallery", tmp_path / "gallery", "--json", "-q")
+    check("demo --gallery", parsed(gallery))
 
 
 def test_verify_and_decode(fhash: Fhash, run: Path, tmp_path: Path) -> None:
