@@ -543,7 +543,7 @@ def history_points(history: Mapping[str, Any]) -> list[HistoryPoint]:
 
 
 class Gain(TypedDict):
-    """What a part of the search of the profile compact came to."""
+    """A part of the search of the profile compact, and what came of it."""
 
     what: Annotated[str, "the part"]
     bytes: Annotated[int, "size of the file after it, estimated but for the last"]

@@ -572,7 +572,7 @@ PROBED = 0.4
 
 
 class Predicted(TypedDict):
-    """What an encoding was predicted to take, as JSON values."""
+    """A prediction of an encoding, as JSON values."""
 
     seconds: Annotated[float, "of the encoding, without the predictions"]
     bytes: Annotated[int | None, "of the file"]

@@ -417,14 +417,14 @@ def reasons(simulation: Simulation) -> list[tuple[str, str]]:
 
 
 class EffectCounts(TypedDict):
-    """What a kind of effect took."""
+    """Counters of a kind of effect."""
 
     made: Annotated[int, "terms that were made; 0 where none is named"]
     places: Annotated[int, "places for which they were computed"]
 
 
 class Counts(TypedDict):
-    """What a simulation took."""
+    """Counters of a simulation."""
 
     frames: Annotated[int, "frames computed"]
     vertices: Annotated[int, "vertices of these frames"]

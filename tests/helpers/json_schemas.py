@@ -1,4 +1,4 @@
-"""What commands print with `--json`, held to its JSON Schemas in both directions."""
+"""Output of commands with `--json`, held to its JSON Schemas in both directions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from click.testing import Result
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path.append(str(DOCS))
 
-from reference_pages import RESULTS, keys, schema_of  # noqa: E402
+from schemas import RESULTS, keys, schema_of  # noqa: E402
 
 Draft = jsonschema.Draft202012Validator
 WHOLE = Draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
@@ -35,7 +35,7 @@ def validator(name: str) -> Any:
 
 
 def faults(name: str, value: Any) -> list[str]:
-    """What keeps a value from being what the schema of a command, or of settings, says."""
+    """Faults of a value by the schema of a command, or of settings."""
     return [
         f"{each.json_path}: {each.message[:300]}" for each in validator(name).iter_errors(value)
     ]

@@ -76,7 +76,7 @@ class EncodeOptions:
 
 
 class Chosen(TypedDict, total=False):
-    """What was chosen for the user, beside the figures of the file."""
+    """Choices made for the user, beside the figures of the file."""
 
     models: Annotated[ModelsCompared, "`--profile auto`: the choice between both models"]
     time_budget: Annotated[TimeBudget, "`--time-budget`: the choice of effort or epochs"]

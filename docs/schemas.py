@@ -1,7 +1,7 @@
 """JSON Schemas of what commands print with `--json` and of settings in files, and their tables.
 
-python docs/reference_pages.py           prints the tables
-python docs/reference_pages.py NAME      prints the schema of a command, or of settings
+python docs/schemas.py           prints the tables
+python docs/schemas.py NAME      prints the schema of a command, or of settings
 """
 
 from __future__ import annotations
