@@ -33,10 +33,9 @@ myst_heading_anchors = 3
 nb_execution_mode = "off"  # outputs are those of `make notebooks`; tests run the cells
 
 maximum_signature_line_length = 88
-python_use_unqualified_type_names = True
 autodoc_member_order = "bysource"
-autodoc_class_signature = "separated"
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"fhash {version}"
@@ -52,7 +51,7 @@ html_theme_options: dict[str, Any] = {
     "footer_start": ["copyright"],
     "footer_end": ["sphinx-version"],
 }
-html_sidebars = {"index": []}
+html_sidebars = {"index": [], "first-hour": [], "gallery": [], "results": []}
 copyright = "the fhash developers"
 linkcheck_anchors = True
 copybutton_exclude = ".linenos, .gp, .go"
@@ -86,7 +85,22 @@ def fields_of_parameters(
     lines[:] = [*made, ""]
 
 
+def signature_as_written(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, shown: str, returned: str
+) -> tuple[str, str] | None:
+    """A signature with annotations as the source has them, not as unions of numpy's protocols."""
+    if what not in ("function", "method", "class") or not shown:
+        return None
+    text = str(inspect.signature(thing))
+    text = re.sub(r"(: |-> )'([^']+)'", r"\1\2", text)
+    text = re.sub(r"<function (\w+) at \w+>", r"\1", text)
+    text = re.sub(r"\b(self|cls)(, |(?=\)))", "", text, count=1)
+    arguments, _, result = text.partition(" -> ")
+    return arguments, "" if what == "class" else result
+
+
 def setup(app: Sphinx) -> None:
     """Register what this site adds to Sphinx."""
     reference_pages.write(Path(__file__).parent / "reference" / "made")
     app.connect("autodoc-process-docstring", fields_of_parameters)
+    app.connect("autodoc-process-signature", signature_as_written)
