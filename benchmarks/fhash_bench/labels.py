@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 import fhash_codec
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.plan import machine
+from fhash_codec.devices import machine
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
