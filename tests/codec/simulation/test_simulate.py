@@ -494,7 +494,7 @@ def test_a_medium_that_is_drawn_out_mixes_sooner() -> None:
     assert wound > 2 * at_rest > 0
 
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scenes.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "howto" / "simulate.md"
 NAMED = "advection vortex rotation front fingers diffusion turbulence buoyancy shell blob"
 
 
