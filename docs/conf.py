@@ -1,4 +1,4 @@
-"""The documentation site: `make docs` builds build/docs, without network and with warnings as errors."""
+"""The documentation site: `make docs` builds build/docs without network; warnings are errors."""
 
 from __future__ import annotations
 

@@ -86,8 +86,8 @@ def _table(rows: Iterator[tuple[str, ...]] | list[tuple[str, ...]], *titles: str
 def command_page() -> str:
     """Every command: its usage, its help, and its options by purpose."""
     parts = [
-        "# Commands\n\nMade from the program; `fhash COMMAND --help` prints the same. Options of all"
-        " commands in one table: [](options.md). Exit codes and output as JSON: [](../../json.md).",
+        "# Commands\n\nMade from the program; `fhash COMMAND --help` prints the same. Options of"
+        " all commands in one table: [](options.md). Exit codes, output as JSON: [](../../json.md).",
     ]
     for name, command in commands():
         context = click.Context(command, info_name=f"fhash {name}")
@@ -124,7 +124,7 @@ def option_page() -> str:
 
 
 def write(folder: Path) -> None:
-    """Write the pages where they are not as they should be, so that Sphinx reads the changed ones."""
+    """Write the pages that changed."""
     folder.mkdir(exist_ok=True)
     for name, text in {"commands.md": command_page(), "options.md": option_page()}.items():
         path = folder / name
