@@ -87,7 +87,7 @@ def command_page() -> str:
     """Every command: its usage, its help, and its options by purpose."""
     parts = [
         "# Commands\n\nMade from the program; `fhash COMMAND --help` prints the same. Options of"
-        " all commands in one table: [](options.md). Exit codes, output as JSON: [](../../json.md).",
+        " all commands in one table: [](options.md). Output as JSON: [](../../json.md).",
     ]
     for name, command in commands():
         context = click.Context(command, info_name=f"fhash {name}")
