@@ -27,7 +27,8 @@ units: .venv/.stamp
 
 # The documentation site: build/docs/index.html. Needs no network; a warning is an error.
 docs: .venv/.stamp
-	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs
+	rm -rf build/docs
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
 # The notebooks of the documentation with their outputs.
 notebooks: .venv/.stamp
