@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units hard every device lib paraview wheels wasm view clean
+.PHONY: demo test types units docs notebooks hard every results device lib paraview wheels wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
@@ -17,13 +17,22 @@ demo: .venv/.plain
 test: .venv/.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j 2 types units
+	$(MAKE) --no-print-directory -j 2 types docs units
 
 types: .venv/.stamp
 	$(BIN)/mypy
 
 units: .venv/.stamp
 	$(BIN)/python -m pytest $(SPREAD)
+
+# The documentation site: build/docs/index.html. Needs no network; a warning is an error.
+docs: .venv/.stamp
+	rm -rf build/docs
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+
+# The notebooks of the documentation with their outputs.
+notebooks: .venv/.stamp
+	cd docs/notebooks && $(CURDIR)/$(BIN)/jupyter execute --inplace *.ipynb && rm -f *.nc *.fhz
 
 # Hard cases, hostile files, faults, fuzzing and `fhash selftest --all`: an hour on 2 processors; needs g++. docs/stability.md
 # gets the figures.
@@ -38,6 +47,10 @@ hard: .venv/.stamp
 # Every case of every other test, of which `make test` runs up to two of each.
 every: .venv/.stamp
 	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
+
+# Figures of README.md and docs/ from benchmarks/results, which hold what `fhash bench ... --json` printed: quick.
+results: .venv/.stamp
+	$(BIN)/python -m fhash_bench.results
 
 # libfhash, shared and static, its header, fhash.pc and CMake's files below build/lib (docs/c-library.md). Needs cmake.
 lib:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import ctypes
+import datetime
 import os
+import platform
+import re
+import shlex
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from fhash_codec.native.network import machine_paths
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
 from fhash_formats.support.threads import at_most, usable_threads
 
@@ -27,6 +34,9 @@ VERTICES_A_THREAD = 12_000
 """Vertices of a training step per thread; with fewer, a further thread costs more than it saves."""
 _PROCESS = os.getpid()
 """The process that imported this module."""
+LIBRARIES = ("numpy", "torch", "h5py", "zarr", "hdf5plugin")
+"""Libraries whose versions `machine` tells where they are loaded; SZ3, SPERR and ZFP are of
+hdf5plugin."""
 
 
 def leave_threads_of_parent() -> None:
@@ -212,3 +222,35 @@ def same_bits(device: str, wanted: bool) -> Iterator[None]:
         yield
     finally:
         torch.use_deterministic_algorithms(before, warn_only=only_warns)
+
+
+def machine(device: torch.device | None = None) -> dict[str, Any]:
+    """Record of where and when figures are taken, as JSON values: date, command line, versions of
+    the libraries that are loaded, and the machine with its load over the last minute.
+
+    device: the one that torch computes on; None for the CPU.
+    """
+    cpuinfo = Path("/proc/cpuinfo")
+    model = re.search("model name.*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else None
+    name = "cpu" if device is None else device.type
+    if name == "cuda":
+        import torch
+
+        name = torch.cuda.get_device_name(device)
+    facts = {
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "device": name,
+        "processor": model[1] if model else platform.processor() or platform.machine(),
+        "vectors": (machine_paths() or ["baseline"])[0],
+        "cores": os.cpu_count(),
+        "threads": usable_threads(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "fhash": version("fhash"),
+        "python": platform.python_version(),
+        **{library: version(library) for library in LIBRARIES if sys.modules.get(library)},
+    }
+    if sys.platform != "win32":
+        gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+        facts |= {"memory": f"{gib:.0f} GiB", "load": round(os.getloadavg()[0], 2)}
+    return facts

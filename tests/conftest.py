@@ -52,6 +52,8 @@ LONG_ROOMS = (
 that of the published figures: what they are wrong in is read by others."""
 QUICK_CASES = 2
 """Cases of a parametrised test that the quick set runs."""
+WHOLE_ROOMS = ("documents",)
+"""Rooms whose cases all run: each is another page that somebody reads."""
 SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
 """Names of files that take a good part of a minute."""
 
@@ -81,7 +83,8 @@ def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
     kept = set()
     for same in cases.values():
         last = len(same) - 1
-        if last < QUICK_CASES:
+        whole = same[0].path.parent.name in WHOLE_ROOMS
+        if last < QUICK_CASES or whole:
             kept |= {item.nodeid for item in same}
         else:
             kept |= {same[n * last // (QUICK_CASES - 1)].nodeid for n in range(QUICK_CASES)}

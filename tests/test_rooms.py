@@ -89,7 +89,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("ablate", "rate"),
         ("paper", "train"),
         ("commands",),
-        ("main",),
+        ("main", "results"),
     ),
 }
 """Rooms from the ground up. A module imports rooms of lower layers only, wherever in it the import

@@ -19,8 +19,8 @@ import numpy as np
 
 from fhash_bench.kept import save
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.plan import machine
 from fhash_codec.cost.report import require_matplotlib
+from fhash_codec.devices import machine
 from fhash_codec.encoding import encode
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent

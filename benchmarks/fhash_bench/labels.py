@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 import fhash_codec
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.plan import machine
+from fhash_codec.devices import machine
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
@@ -272,7 +272,7 @@ class LabelReport(TypedDict):
     """Figures of all series, as JSON values."""
 
     kinds: Annotated[list[dict[str, Any]], list[LabelSize], "each series, the worst ratio first"]
-    machine: Annotated[dict[str, Any], "device, processor, cores, threads"]
+    machine: Annotated[dict[str, Any], "date, command line, processor, load, versions and more"]
     notes: Annotated[list[str], "how it was measured"]
 
 

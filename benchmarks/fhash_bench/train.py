@@ -19,9 +19,8 @@ from fhash_bench.engines import GOALS, EngineFigures, EngineRun, Peak, Peaks, Va
 from fhash_bench.rate.generated import DEFAULT, is_made, made_series
 from fhash_codec.boxes import Box, TableSource
 from fhash_codec.config import ENGINES, EncodeConfig
-from fhash_codec.cost.plan import machine
 from fhash_codec.cost.report import require_matplotlib
-from fhash_codec.devices import choose_device, threads_for
+from fhash_codec.devices import choose_device, machine, threads_for
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.selection import Source, open_source
@@ -220,7 +219,7 @@ class TrainBench(TypedDict):
     shares are by the time that passes, and peaks by events of the device.
     """
 
-    machine: Annotated[dict[str, Any], "device, processor, cores, threads, torch"]
+    machine: Annotated[dict[str, Any], "date, command line, processor, load, versions and more"]
     peaks: Annotated[list[dict[str, Any]], list[Peak], "of one thread"]
     series: Annotated[list[TrainSeries], "with features and whole, for each number of bricks"]
 
@@ -284,7 +283,7 @@ def bench_train(
     return {
         "series": results,
         "peaks": peaks.to_json(),
-        "machine": machine() | _torch_on(device),
+        "machine": machine(device) | {"threads": torch.get_num_threads()},
     }
 
 
@@ -393,15 +392,6 @@ def _first(results: list[dict[str, Any]], **facts: Any) -> dict[str, Any] | None
         (result for result in results if all(result[key] == fact for key, fact in facts.items())),
         None,
     )
-
-
-def _torch_on(device: torch.device) -> dict[str, Any]:
-    """Describe torch and the device that it computes on."""
-    return {
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-    }
 
 
 COLOURS = {"native": "#d1604b", "slab": "#4a86c0"}

@@ -20,12 +20,12 @@ from fhash_codec.cost.plan import (
     cropped,
     described,
     facts_of,
-    machine,
     wishes,
 )
 from fhash_codec.cost.prediction import predictor
 from fhash_codec.cost.results import CostReport, Curve, Encoded, Gain, Picture, Read, Stage, advise
 from fhash_codec.cost.uses import PictureCosts, measure_reads
+from fhash_codec.devices import machine
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume

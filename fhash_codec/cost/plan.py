@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,7 +21,6 @@ from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import FhashError
 from fhash_formats.series import Series
-from fhash_formats.support.threads import usable_threads
 
 OVERRUN = 0.25
 """Share of its time by which work that has begun may exceed it."""
@@ -343,13 +340,3 @@ def _psnr(effort: int, target: float) -> Wish:
 def _peers(target: float) -> Iterator[Wish]:
     for name in PEERS:
         yield Wish(codec=name, group=name, target=float(target))
-
-
-def machine() -> dict[str, Any]:
-    """Describe the processor, cores and threads of this machine, which computes on its CPU."""
-    return {
-        "device": "cpu",
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": usable_threads(),
-    }

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,10 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.devices import choose_device, has_torch
 from fhash_codec.volume import Volume
 from fhash_formats.series import Series
-from fhash_formats.support.threads import usable_threads
 
 RUN_THREADS = 4
 """Threads with which every case is encoded. A check repeats the encoding with other numbers of
@@ -120,20 +116,6 @@ class Case:
     checks: tuple[Check, ...] = ()
     quick: bool = True
     refused: str | None = None
-
-
-def describe_machine() -> str:
-    """Versions, machine and the parts of it that are used, in one line. Loads torch if it can."""
-    facts = [
-        f"fhash {version('fhash')}",
-        f"Python {platform.python_version()}",
-        f"numpy {version('numpy')}",
-        f"torch {version('torch')}" if has_torch() else "no torch",
-        f"{platform.system()} {platform.machine()}",
-        f"{usable_threads()} processors",
-        "CUDA" if has_torch() and choose_device("auto").type == "cuda" else "no CUDA",
-    ]
-    return ", ".join(facts)
 
 
 @contextmanager

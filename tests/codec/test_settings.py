@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import MISSING, FrozenInstanceError, dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +30,13 @@ from fhash_codec.devices import (
     enough_memory,
     has_torch,
     leave_threads_of_parent,
+    machine,
     need_torch,
     same_bits,
     threads_for,
     training_device,
 )
+from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.engines.native import cpu_seconds
 from fhash_codec.paper.network import Architecture
 from fhash_codec.progress import OTHER, Parts, attribute, recording, skip, stage
@@ -183,6 +187,19 @@ def test_memory_that_runs_out_is_one_line_with_advice() -> None:
     assert "\n" not in str(told.value)
     with pytest.raises(RuntimeError, match="CUDA error"), enough_memory("cuda"):
         raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+
+def test_the_record_of_a_measurement_is_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_THREADS", "3")
+    monkeypatch.setattr(sys, "argv", ["/bin/fhash", "bench", "rate", "my data.h5"])
+    record = machine()
+    assert json.loads(json.dumps(record)) == record
+    assert record["command"] == "fhash bench rate 'my data.h5'"
+    assert (record["device"], record["cores"], record["threads"]) == ("cpu", os.cpu_count(), 3)
+    assert record["processor"]
+    assert record["vectors"] in (*machine_paths(), "baseline")
+    assert (record["numpy"], record["torch"]) == (np.__version__, torch.__version__)
+    assert date.fromisoformat(record["date"])
 
 
 @pytest.mark.parametrize("before", [False, True])

@@ -29,7 +29,7 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 if TYPE_CHECKING:
     from fhash_bench.labels import LabelBench
     from fhash_bench.rate.measuring import RateBench
-    from fhash_bench.rate.table import RateTable
+    from fhash_bench.rate.table import RateCell, RateTable
 
 NONE = "none"
 """Name that stands for no peer at all."""
@@ -213,7 +213,7 @@ def rate(
 
 def _rate_text(result: RateBench) -> str:
     """Tables of bytes, speed and access, and notes on how they were measured."""
-    lines = [_bytes_table(result)]
+    lines = [table(bytes_rows(result))]
     if any(point.as_asked is False for point in result.points):
         lines.append(
             "* its own tolerance of this bound does not keep it;"
@@ -225,9 +225,9 @@ def _rate_text(result: RateBench) -> str:
         for codec, point in short.items()
     ]
     if result.speeds:
-        lines.append("\n" + _speed_table(result))
+        lines.append("\n" + table(speed_rows(result)))
     if result.access:
-        lines.append("\n" + _access_table(result))
+        lines.append("\n" + table(access_rows(result)))
     if result.tiles:
         lines.append("\n" + _tiles_table(result))
     lines += [
@@ -244,7 +244,7 @@ def _rate_text(result: RateBench) -> str:
     return "\n".join(lines)
 
 
-def _bytes_table(result: RateBench) -> str:
+def bytes_rows(result: RateBench) -> list[tuple[str, ...]]:
     """A row for each quality: bytes of each codec, and how many times larger the best peer is."""
     codecs = list(dict.fromkeys(point.codec for point in result.points))
     points = {(point.goal, point.asked, point.codec): point for point in result.points}
@@ -260,10 +260,10 @@ def _bytes_table(result: RateBench) -> str:
             cells.append(f"{point.bytes:,}{broken}" if point is not None and point.reached else "-")
         name = _quality(goal, asked)
         rows.append((name, *cells, *(number(row["ratios"][codec], "x", digits=3) for codec in own)))
-    return table(rows)
+    return rows
 
 
-def _speed_table(result: RateBench) -> str:
+def speed_rows(result: RateBench) -> list[tuple[str, ...]]:
     """A row for each codec: PSNR, and speed of encoding and decoding."""
     rows = [
         (
@@ -277,7 +277,7 @@ def _speed_table(result: RateBench) -> str:
         for speed in result.speeds
     ]
     header = ("speed", "PSNR", "encode MB/s", "decode MB/s", "encode, a core", "decode, a core")
-    return table([header, *rows])
+    return [header, *rows]
 
 
 def _tiles_table(result: RateBench) -> str:
@@ -300,7 +300,7 @@ def _quality(goal: str, asked: float) -> str:
     return f"{asked:g} dB" if goal == "psnr" else f"within {100 * asked:g} %"
 
 
-def _access_table(result: RateBench) -> str:
+def access_rows(result: RateBench) -> list[tuple[str, ...]]:
     """A row for each codec and layout: time and bytes that a small region takes."""
     rows = [
         (
@@ -313,7 +313,7 @@ def _access_table(result: RateBench) -> str:
         for entry in result.access
     ]
     region = f"{extent(result.access[0].region)} of a step"
-    return table([(region, "PSNR", "bytes", "ms", "bytes read"), *rows])
+    return [(region, "PSNR", "bytes", "ms", "bytes read"), *rows]
 
 
 @click.command(
@@ -423,8 +423,8 @@ def rate_table(
     emit(result.to_dict(), _table_text(result), as_json)
 
 
-def _table_text(result: RateTable) -> str:
-    """A row for each series, quality and codec, and how they were measured."""
+def cell_rows(cells: Sequence[RateCell]) -> list[tuple[str, ...]]:
+    """A row for each series, quality and codec."""
     header = ("series", "quality", "codec", "bytes", "encode MB/s", "decode MB/s", "region ms")
     rows = [
         (
@@ -440,12 +440,17 @@ def _table_text(result: RateTable) -> str:
             + ("" if cell.reached else " !"),
             cell.setting or cell.why or "-",
         )
-        for cell in result.cells
+        for cell in cells
     ]
+    return [(*header, "PSNR", "error", "layout"), *rows]
+
+
+def _table_text(result: RateTable) -> str:
+    """The cells, and how they were measured."""
     seconds = number(result.startup_seconds, "s", digits=2)
     return "\n".join(
         [
-            table([(*header, "PSNR", "error", "layout"), *rows]),
+            table(cell_rows(result.cells)),
             "",
             *result.notes,
             f"start-up of fhash, a whole `fhash encode` of 16 values: {seconds},"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
-import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -45,8 +43,7 @@ from fhash_bench.paper.measures import (
     train,
 )
 from fhash_bench.paper.trained import TrainedEncoding, build, missing
-from fhash_codec.cost.plan import machine
-from fhash_codec.devices import choose_device, threads_for
+from fhash_codec.devices import choose_device, machine, threads_for
 from fhash_codec.progress import Progress, silent
 from fhash_formats.series import Series
 
@@ -316,7 +313,7 @@ def _run(request: Request, held: _Held, device: torch.device, progress: Progress
         settings={**request.settings, "feature_resolved": str(data.features[0])},
         latency=latency,
         between=measure_between(encoding, held.places),
-        machine=_machine(device, threads),
+        machine=machine(device) | {"threads": threads},
         collisions=encoding.collisions,
         trial=tuple(trial),
         engine=arranged.engine,
@@ -385,20 +382,3 @@ def _stored_bytes(encoding: TrainedEncoding) -> int:
     from numcodecs.zstd import compress
 
     return sum(len(compress(np.ascontiguousarray(a), ZSTD_LEVEL)) for a in encoding.arrays())
-
-
-def _machine(device: torch.device, threads: int) -> dict[str, Any]:
-    """Describe the machine, the versions and the date."""
-    from importlib.metadata import version
-
-    gpu = {"device": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}
-    return {
-        **machine(),
-        **gpu,
-        "threads": threads,
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-        "fhash": version("fhash"),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-    }

@@ -23,8 +23,8 @@ from fhash_bench.pictures.results import (
 )
 from fhash_bench.pictures.shell import beside_shell, find_ospray, load_ospray, orbit
 from fhash_bench.pictures.vtk import Comparison
-from fhash_codec.cost.plan import machine
 from fhash_codec.cost.uses import FINEST, STEPS, THRESHOLDS, in_turns, picture_psnr
+from fhash_codec.devices import machine
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.renderer import Renderer

@@ -239,7 +239,7 @@ class RenderBench:
         series: source and variable. shape: (t, z, y, x). step: step drawn.
         size: pixels along both sides. turns: runs of each median.
         refused: for each part that could not be measured, the reason.
-        machine: device, processor, cores, threads. notes: how it was measured.
+        machine: date, command line, processor, load, versions. notes: how it was measured.
     """
 
     series: str

@@ -11,8 +11,8 @@ import numpy as np
 
 from fhash_bench.rate.measuring import OWN, PEERS, PROFILES, Bench, Point, RateBench, promised
 from fhash_bench.rate.peers import PROGRAMS, AnyVariant, all_filters, programs
-from fhash_codec.cost.plan import machine
 from fhash_codec.cost.report import require_matplotlib
+from fhash_codec.devices import machine
 from fhash_codec.features.scan import scan
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent

@@ -21,7 +21,7 @@ from fhash_bench.kept import file_name, load, of_fields, save
 from fhash_bench.rate.measuring import OWN, Bench, shown_psnr
 from fhash_bench.rate.peers import AnyVariant, spent
 from fhash_bench.rate.rate import all_variants, bench_of, check, goals_of
-from fhash_codec.cost.plan import machine
+from fhash_codec.devices import machine
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series

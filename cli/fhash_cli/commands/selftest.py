@@ -69,7 +69,7 @@ def command(
     with Progress(quiet=quiet) as progress:
         summary = run_cases(cases, everything=everything, processes=processes, progress=progress)
     if report is not None:
-        from fhash_codec.selftest.case import describe_machine
+        from fhash_codec.devices import choose_device, has_torch, machine
         from fhash_codec.selftest.run import markdown
         from fhash_formats.support.files import replacing
 
@@ -81,7 +81,8 @@ def command(
             ]
         )
         minutes = (time.perf_counter() - begun) / 60
-        where = f"It took {minutes:.1f} minutes with {describe_machine()}."
+        facts = machine(choose_device("auto") if has_torch() else None).items()
+        where = f"It took {minutes:.1f} minutes: {', '.join(f'{a} {b}' for a, b in facts)}."
         with replacing(Path(report), force=force) as temporary:
             temporary.write_text(markdown(summary, options=given, where=where), encoding="utf-8")
     emit(summary.to_dict(), _text(summary), as_json)

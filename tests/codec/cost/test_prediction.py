@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,7 +35,6 @@ from fhash_codec.cost.plan import (
     cropped,
     described,
     facts_of,
-    machine,
     paper_config,
     wishes,
 )
@@ -294,16 +292,6 @@ def test_a_budget_that_cannot_be_kept_is_told() -> None:
     assert "time budget of 5 s may not be kept: even --effort 1" in choice.why
     told = choice.to_dict()
     assert (told["fits"], told["chosen"], told["predicted"]["bytes"]) == (False, "--effort 1", 1234)
-
-
-def test_the_machine_is_described_by_json_values(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_THREADS", "3")
-    described = machine()
-    assert described["device"] == "cpu"
-    assert described["processor"]
-    assert described["cores"] == os.cpu_count()
-    assert described["threads"] == 3
-    assert json.loads(json.dumps(described)) == described
 
 
 class Clock:

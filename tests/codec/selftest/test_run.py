@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
-from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +18,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.rendering.plan import plan_picture
 from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest import checks, ray_cases, value_cases
-from fhash_codec.selftest.case import Case, Check, Finding, Run, describe_machine, environment
+from fhash_codec.selftest.case import Case, Check, Finding, Run, environment
 from fhash_codec.selftest.field_cases import TIME_CASES, series
 from fhash_codec.selftest.run import (
     CaseResult,
@@ -62,15 +61,6 @@ def test_the_environment_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     assert seen == [("2", "0")]
     assert os.environ["FHASH_THREADS"] == "3"
     assert "OMP_TEST" not in os.environ
-
-
-def test_the_machine_is_described_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_THREADS", "3")
-    facts = describe_machine().split(", ")
-    assert facts[0] == f"fhash {version('fhash')}"
-    assert f"numpy {version('numpy')}" in facts
-    assert "3 processors" in facts
-    assert facts[-1] in ("CUDA", "no CUDA")
 
 
 def case_result(name: str, worst: float, errors: tuple[str, ...] = ()) -> CaseResult:
