@@ -38,9 +38,9 @@ RESULTS = {
     "render --evolution": "fhash_cli.commands.render.Evolved",
     "view": "fhash_cli.commands.view.Shown",
     "view --static": "fhash_cli.commands.view.Written",
-    "info": "fhash_codec.volume_model.VolumeInfo",
-    "info of several variables": "fhash_cli.commands.info.DatasetInfo",
-    "info DATA": "fhash_cli.commands.info.DataInfo",
+    "info": "fhash_codec.file_info.VolumeInfo",
+    "info of several variables": "fhash_codec.file_info.DatasetInfo",
+    "info DATA": "fhash_codec.file_info.DataInfo",
     "serve": "fhash_cli.commands.zarr.Served",
     "export": "fhash_codec.plain.ExportReport",
     "verify": "fhash_cli.commands.checks.Verified",
@@ -87,10 +87,8 @@ ALSO = {
 """Properties and methods of dataclasses whose values stand beside their fields in JSON."""
 ELSEWHERE = """
 fhash_bench.paper.printed.TableReport fhash_codec.cost.encodings.ModelsCompared
-fhash_codec.cost.prediction.TimeBudget fhash_codec.header.FileInfo
-fhash_codec.rendering.tracking.Followed fhash_codec.simulation.simulate.Counts
-fhash_formats.container.reader.Split fhash_formats.readers.listing.ListedVariable
-fhash_formats.series.NotStoredValues
+fhash_codec.cost.prediction.TimeBudget fhash_codec.rendering.tracking.Followed
+fhash_codec.simulation.simulate.Counts
 """
 """Records whose names the modules of commands know only to mypy, so that they start fast."""
 TYPES = {
@@ -183,7 +181,8 @@ def _meaning(schema: Schema) -> str:
         told.append(f"{bounds['minimum']:g} to {bounds['maximum']:g}")
     if schema.get("default") not in (None, []):
         told.append(f"default `{json.dumps(schema['default'])}`")
-    return "; ".join(filter(None, told)).replace("\n", " ").replace("|", "\\|")
+    text = "; ".join(filter(None, told)).replace("\n", " ").replace("|", "\\|")
+    return re.sub(r"(?<![\w`-])(--[a-z][a-z-]*)", r"`\1`", text)  # else a dash on the site
 
 
 def _records(paths: str) -> list[Any]:

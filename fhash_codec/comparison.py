@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.selection import Source, open_source
-from fhash_codec.header import Gain, HistoryPoint
+from fhash_codec.file_info import Gain, HistoryPoint
 from fhash_codec.measure.errors import find_bulk
 from fhash_codec.measure.metrics import BUDGET as SSIM_BUDGET
 from fhash_codec.measure.metrics import (

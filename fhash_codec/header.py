@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.occupancy import write_bits
-from fhash_codec.measure.errors import StepErrors
-from fhash_codec.measure.metrics import BetweenQuality, even_steps
+from fhash_codec.measure.metrics import even_steps
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import (
     SOURCE,
@@ -40,13 +39,11 @@ from fhash_formats.container.header import (
     STEPS,
     TOGETHER,
 )
-from fhash_formats.container.reader import Split
 from fhash_formats.errors import InputError
 from fhash_formats.series import (
     AXES,
     AXIS_NAMES,
     Coordinate,
-    NotStoredValues,
     Series,
     SourceMetadata,
     with_history,
@@ -55,6 +52,7 @@ from fhash_formats.support.values import is_within, json_attributes
 
 if TYPE_CHECKING:
     from fhash_codec.features.scan import Scan
+    from fhash_codec.file_info import FileInfo, HistoryPoint
 
 DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
 .pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
@@ -527,27 +525,11 @@ def brief_history(
     }
 
 
-class HistoryPoint(TypedDict):
-    """A point of the course of a training."""
-
-    epoch: Annotated[float, "epoch, or update of the head"]
-    seconds: Annotated[float | None, "since its beginning; null with `--no-timings`"]
-    psnr: Annotated[float | None, "dB on samples"]
-
-
 def history_points(history: Mapping[str, Any]) -> list[HistoryPoint]:
     """The points of a header's training history."""
     lists = {name: history[name] for name in HISTORY if name in history}
     points = [dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=True)]
-    return [cast(HistoryPoint, {"seconds": None, "psnr": None, **point}) for point in points]
-
-
-class Gain(TypedDict):
-    """A part of the search of the profile compact, and what came of it."""
-
-    what: Annotated[str, "the part"]
-    bytes: Annotated[int, "size of the file after it, estimated but for the last"]
-    seconds: NotRequired[Annotated[float, "since the search began; not with `--no-timings`"]]
+    return [cast("HistoryPoint", {"seconds": None, "psnr": None, **point}) for point in points]
 
 
 def full_header(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[str, Any]:
@@ -600,93 +582,6 @@ def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
-class BulkFigures(TypedDict):
-    """Figures of the bulk of the values in a file."""
-
-    psnr: NotRequired[Annotated[float | None, "dB, relative to that range"]]
-    range: Annotated[list[float], "first and last value of the range"]
-
-
-class FileQuality(TypedDict, total=False):
-    """Figures of the quality in a file, rounded to the worse side; some writers know but a few."""
-
-    psnr: Annotated[float | None, "dB over the coreset"]
-    bulk: Annotated[BulkFigures | None, "of the middle 98 % of the values; null without such"]
-    rmse: Annotated[float | None, "over the coreset, in data units"]
-    max_abs_error: Annotated[float | None, "over the coreset, in data units"]
-    ssim: Annotated[float | None, "over the coreset"]
-    ssim_window: Annotated[dict[str, Any], "how the similarity was measured"]
-    psnr_domain: Annotated[float | None, "dB over every finite vertex"]
-    rmse_domain: Annotated[float | None, "over every finite vertex"]
-    max_abs_error_domain: Annotated[float | None, "over every finite vertex"]
-    between: Annotated[dict[str, float | None], BetweenQuality, "at key frames and between them"]
-    per_step: Annotated[list[StepErrors], "of each step, or of some neighbours together"]
-
-
-class Variable(TypedDict):
-    """The variable of a file."""
-
-    name: Annotated[str, "name in the source"]
-    units: Annotated[str, "units, may be empty"]
-    dtype: Annotated[str, "number type of the source"]
-    attributes: Annotated[dict[str, Any], "attributes of the source"]
-    fill: NotRequired[Annotated[float, "what stood in the source for a missing value, if any did"]]
-    not_stored: NotRequired[Annotated[NotStoredValues, "values that nobody wrote"]]
-
-
-class Domain(TypedDict):
-    """The lattice of a file."""
-
-    shape: Annotated[list[int], "(t, z, y, x)"]
-
-
-class ArrayOfFile(TypedDict):
-    """An array of a file."""
-
-    shape: Annotated[list[int], "lengths of the axes"]
-    dtype: Annotated[str, "number type"]
-    bytes: Annotated[int, "bytes that it takes in the file"]
-
-
-class FileInfo(TypedDict):
-    """The header of a file, and what follows from it."""
-
-    path: Annotated[str, "the file"]
-    name: NotRequired[Annotated[str, "of a variable among several"]]
-    bytes: Annotated[int, "its size"]
-    split: Annotated[dict[str, int], Split, "`bytes` by what they hold; they add up to it"]
-    overhead_bytes: Annotated[int, "bytes of it that are no values"]
-    raw_bytes: Annotated[int, "size of the array in the source's number type"]
-    ratio: Annotated[float, "`raw_bytes / bytes`"]
-    format: Annotated[Literal["fhash"], "name of the format"]
-    format_version: Annotated[list[int], "major and minor"]
-    required_features: Annotated[list[str], "what a reader must know"]
-    encoder: Annotated[
-        dict[str, Any], "version and seed; what was predicted; of `fhash pack`, the codec"
-    ]
-    variable: Annotated[Variable, "what the values are"]
-    source: NotRequired[Annotated[dict[str, Any], "what belongs to the variable"]]
-    domain: Annotated[Domain, "the lattice"]
-    coordinates: Annotated[dict[str, Any], "coordinates that need no array"]
-    value_range: Annotated[list[float], "smallest and largest value"]
-    background: Annotated[float, "value outside the coreset on request"]
-    features: Annotated[list[str], "as `--feature` names them"]
-    dilation: Annotated[int, "vertices by which they grew"]
-    feature_bounding_box: Annotated[list[list[int]], "[first, end) along z, y and x"]
-    coreset_fraction: Annotated[float, "share of the domain that is kept, 0 to 1"]
-    key_frames: Annotated[list[int], "steps that were encoded"]
-    model: Annotated[dict[str, Any], "the model, see FORMAT.md, The model"]
-    config: Annotated[dict[str, Any], "every setting that the file was made with"]
-    training: Annotated[dict[str, Any], "seconds, epochs, device and more"]
-    history: Annotated[list[HistoryPoint], "course of the training"]
-    quality: Annotated[FileQuality, "figures of the quality"]
-    array: NotRequired[Annotated[str, "path of the array of the values, where one shows them"]]
-    shares: NotRequired[Annotated[dict[str, Any], "arrays that are those of another variable"]]
-    part: NotRequired[Annotated[dict[str, Any], "of a series that is encoded in parts"]]
-    dimensions: Annotated[list[str], "names of the axes at the root, (t, z, y, x)"]
-    arrays: Annotated[dict[str, ArrayOfFile], "arrays of the file by path"]
-
-
 def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> FileInfo:
     """The header of a container, and what follows from it; see `Volume.info`."""
     header = container.header
@@ -700,7 +595,7 @@ def describe_file(container: Container, path: object, key_frames: Sequence[int])
         for array in container.arrays.values()
     }
     return cast(
-        FileInfo,
+        "FileInfo",
         {
             **full_header(header, container.arrays),
             "path": str(path),

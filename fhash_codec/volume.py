@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ from fhash_codec.boxes import (
 )
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.header import FileInfo, describe_file, read_missing
+from fhash_codec.header import describe_file, read_missing
 from fhash_codec.measure.value_range import ValueRange, decoded_type
 from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
@@ -33,6 +33,9 @@ from fhash_formats.errors import InputError, MissingDependencyError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
 from fhash_formats.transform.values import about_origin
+
+if TYPE_CHECKING:
+    from fhash_codec.file_info import FileInfo
 
 Number = int | float
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from math import floor, prod
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from fhash_codec.boxes import Box, Mlp, Spans, Table
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
-from fhash_codec.header import FileInfo, metadata_of
+from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
 from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, RESIDUAL, TABLE
 from fhash_formats.errors import InputError
@@ -22,6 +22,7 @@ from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.values import Mask
 
 if TYPE_CHECKING:
+    from fhash_codec.file_info import CardLayer, CardOccupancy, ModelCard, Stored
     from fhash_codec.paper.model import PaperModel
 
 Positions = npt.NDArray[np.float64]
@@ -53,65 +54,6 @@ def open_model(container: Container) -> VolumeModel:
     from fhash_codec.paper.model import PaperModel
 
     return PaperModel(container)
-
-
-class Stored(TypedDict):
-    """The place of a part of a model in its file."""
-
-    path: Annotated[str, "its array, group or document; empty where it has none"]
-    coding: Annotated[str, "codec, or what stands in its place"]
-    bytes: Annotated[int, "bytes that it takes in the file"]
-
-
-class CardSettings(Stored):
-    """The settings of a model."""
-
-    settings: Annotated[int, "how many there are"]
-
-
-class CardTable(Stored):
-    """A level of a model."""
-
-    level: Annotated[int, "number of the level, from 1"]
-    shape: Annotated[list[int], "key frames, z, y, x, numbers at a vertex"]
-    dtype: Annotated[str, "number type as read"]
-
-
-class CardLayer(Stored):
-    """A layer of a model."""
-
-    layer: Annotated[int, "number of the layer, from 1"]
-    shape: Annotated[list[int], "outputs and inputs"]
-    activation: Annotated[str, "`relu`, `leaky` or `linear`"]
-
-
-class CardOccupancy(Stored):
-    """The bits of the coreset."""
-
-    shape: Annotated[list[int], "key frames and bytes of each"]
-    apart: Annotated[list[str], "features that have bits of their own; empty where merged, or one"]
-
-
-class CardResidual(Stored):
-    """The values that a network lacks, at every vertex of the box and step."""
-
-    shape: Annotated[list[int], "steps, z, y, x"]
-
-
-class ModelCard(TypedDict):
-    """The parts of a model and where they lie in the file."""
-
-    config: Annotated[CardSettings, "the settings"]
-    tables: Annotated[list[CardTable], "levels, finest first"]
-    mlp: Annotated[list[CardLayer], "layers; empty where there is no network"]
-    occupancy: Annotated[CardOccupancy, "bits of the coreset"]
-    residual: NotRequired[Annotated[CardResidual, "what a network lacks, where it has a bound"]]
-
-
-class VolumeInfo(FileInfo):
-    """The header of a file, what follows from it, and its card."""
-
-    card: Annotated[ModelCard, "parts of the model and where they lie in the file"]
 
 
 class Card:

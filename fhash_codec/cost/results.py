@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fhash_codec.header import HistoryPoint
+from fhash_codec.file_info import HistoryPoint
 from fhash_codec.measure.errors import StepErrors
 
 OWN = ("compact", "paper")

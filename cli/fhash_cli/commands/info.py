@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -33,11 +33,15 @@ from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec import Dataset, Volume
-    from fhash_codec.header import FileInfo
-    from fhash_codec.volume_model import VolumeInfo
-    from fhash_formats.container.reader import Split
-    from fhash_formats.readers.listing import Listed, ListedVariable
-    from fhash_formats.series import Coordinate, NotStoredValues, Series
+    from fhash_codec.file_info import (
+        CoordinateDetails,
+        DataInfo,
+        DatasetInfo,
+        SeriesDetails,
+        VolumeInfo,
+    )
+    from fhash_formats.readers.listing import Listed
+    from fhash_formats.series import Coordinate, Series
 
 
 def card_rows(info: Mapping[str, Any], *, verbose: bool) -> list[tuple[str, str]]:
@@ -226,51 +230,6 @@ def _dimension(name: str, length: int, axis: str) -> str:
     """A dimension and what it is: "lev=17 (z)"."""
     note = {"?": " (?)", "select": " (select one)", name: ""}.get(axis, f" ({axis})")
     return f"{name}={length}{note}"
-
-
-class CoordinateDetails(TypedDict):
-    """An axis of a series."""
-
-    axis: Annotated[str, "`t`, `z`, `y` or `x`"]
-    name: Annotated[str, "name of the axis"]
-    first: Annotated[float | None, "first position"]
-    last: Annotated[float | None, "last position"]
-    units: Annotated[str, "may be empty"]
-    dates: Annotated[list[str], "first and last time as dates; empty where they are none"]
-
-
-class SeriesDetails(TypedDict):
-    """An open series."""
-
-    name: Annotated[str, "as a container has it"]
-    shape: Annotated[list[int], "(t, z, y, x)"]
-    dtype: Annotated[str, "number type of the values"]
-    units: Annotated[str, "may be empty"]
-    fill: Annotated[float | None, "what stands for a missing value"]
-    not_stored: Annotated[NotStoredValues | None, "values that nobody wrote"]
-    coordinates: Annotated[list[CoordinateDetails], "of t, z, y and x"]
-    attributes: Annotated[dict[str, Any], "attributes of the variable"]
-
-
-class DataInfo(TypedDict):
-    """Data that can be encoded, instead of a container."""
-
-    path: Annotated[str, "as given"]
-    files: Annotated[int, "files of a pattern; 1 without one"]
-    variables: Annotated[list[ListedVariable], "what can be encoded and what cannot"]
-    series: NotRequired[Annotated[SeriesDetails, "the series that `--var`, `--t` choose"]]
-
-
-class DatasetInfo(TypedDict):
-    """A container of several variables."""
-
-    path: Annotated[str, "the file"]
-    format_version: Annotated[list[int], "major and minor"]
-    bytes: Annotated[int, "its size"]
-    split: Annotated[dict[str, int], Split, "`bytes` by what they hold; they add up to it"]
-    raw_bytes: Annotated[int, "size of the values in the number types of their sources"]
-    ratio: Annotated[float, "`raw_bytes / bytes`"]
-    variables: Annotated[dict[str, FileInfo], "header of each by name, and what follows from it"]
 
 
 def details(series: Series) -> SeriesDetails:
