@@ -1,4 +1,4 @@
-"""Pages of the reference that are made from the program: commands and options.
+"""Pages of the reference that are made from the program: commands, options, JSON and settings.
 
 They are written below docs/reference/made before Sphinx reads its sources; git ignores them.
 """
@@ -6,11 +6,13 @@ They are written below docs/reference/made before Sphinx reads its sources; git 
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import click
+import schemas
 
 from fhash_cli.main import COMMANDS, program
 from fhash_cli.options import GROUPS, LAST, group_of
@@ -123,10 +125,24 @@ def option_page() -> str:
     )
 
 
+def schema_pages() -> Iterator[tuple[str, str]]:
+    """Files by name: keys of JSON, settings in files, and the schema of each."""
+    pages = {"json.md": ["# Keys of JSON"], "settings.md": ["# Settings in files"]}
+    for name, schema in schemas.schemas().items():
+        file = re.sub(r"\W+", "-", name).strip("-") + ".json"
+        words = "" if name[0].isupper() or name == "errors" else "fhash "
+        page = pages["settings.md" if name in schemas.SETTINGS else "json.md"]
+        page += [f"## `{words}{name}`", f"{{download}}`JSON Schema <{file}>`"]
+        page.append(schemas.markdown(schema))
+        yield file, json.dumps(schema, indent=1)
+    yield from ((name, "\n\n".join(parts) + "\n") for name, parts in pages.items())
+
+
 def write(folder: Path) -> None:
     """Write the pages that changed."""
     folder.mkdir(exist_ok=True)
-    for name, text in {"commands.md": command_page(), "options.md": option_page()}.items():
+    made = {"commands.md": command_page(), "options.md": option_page(), **dict(schema_pages())}
+    for name, text in made.items():
         path = folder / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")

@@ -8,59 +8,93 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.selection import Source, open_source
+from fhash_codec.file_info import Gain, HistoryPoint
 from fhash_codec.measure.errors import find_bulk
 from fhash_codec.measure.metrics import BUDGET as SSIM_BUDGET
 from fhash_codec.measure.metrics import (
     Comparer,
     Comparison,
     NeighboursOf,
+    Quality,
     measure_quality,
     neighbours_of,
     ssim_steps,
 )
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.progress import Progress, silent
+from fhash_codec.progress import Progress, Stage, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Place
+from fhash_formats.container.reader import Split
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series, step_blocks
 from fhash_formats.transform.values import about_origin
 
-FIGURES = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain")
-"""Figures of a quality that a report has at its top level, beside all of them in `quality`."""
+
+class Sizes(TypedDict):
+    """A written file, and its sizes."""
+
+    path: Annotated[str, "the file written"]
+    bytes: Annotated[int, "its size"]
+    split: Annotated[dict[str, int], Split, "`bytes` by what they hold; they add up to it"]
+    raw_bytes: Annotated[int, "size of the values in the source's number type"]
+    ratio: Annotated[float, "`raw_bytes / bytes`"]
+    seconds: Annotated[float, "of the whole job"]
+
+
+class Report(Sizes):
+    """Sizes, quality and training of a container; null where a figure has no finite value."""
+
+    source_bytes: Annotated[int | None, "size on disk of the files read; null without files"]
+    source_ratio: Annotated[float | None, "`source_bytes / bytes`"]
+    psnr: Annotated[float | None, "dB over the coreset; null if error or range is 0"]
+    psnr_bulk: Annotated[float | None, "dB within, and relative to, the middle 98 %"]
+    rmse: Annotated[float | None, "root of the mean squared error in the coreset, in data units"]
+    max_abs_error: Annotated[float | None, "largest error in the coreset, in data units"]
+    ssim: Annotated[float | None, "mean structural similarity over the coreset"]
+    psnr_domain: Annotated[float | None, "dB over all, background outside the coreset"]
+    epochs: Annotated[int, "of the training; of the head in the profile compact, 0 without one"]
+    curve: Annotated[list[HistoryPoint], "course of the training"]
+    shape: Annotated[list[int], "of the series, (t, z, y, x)"]
+    key_frames: Annotated[list[int], "steps that were encoded"]
+    feature_bounding_box: Annotated[list[list[int]], "[first, end) along z, y and x"]
+    coreset_fraction: Annotated[float, "share of the domain that is kept, 0 to 1"]
+    data_range: Annotated[float, "largest less smallest value"]
+    parameters: Annotated[int, "numbers of the model other than 0"]
+    profile: Annotated[Literal["compact", "paper"], "the model"]
+    tables_loss_db: Annotated[float | None, "dB that coded tables lose at the key frames"]
+    device: Annotated[Literal["cpu", "cuda"], "where it was trained"]
+    restarts: Annotated[int, "times that the training diverged and began again, slower"]
+    gains: Annotated[list[Gain], "what the search of the profile compact went through"]
+    quality: Annotated[dict[str, Any], Quality, "all figures of the quality"]
+
+
+class EncodeReport(Report):
+    """Figures of a file that was encoded."""
+
+    stages: NotRequired[Annotated[list[dict[str, Any]], list[Stage], "`--explain`"]]
+
+
+class Compared(Report):
+    """Figures of a container against its data; `seconds` is the time of the comparison."""
+
+    differences: Annotated[list[str], "other differences than of values: name, units, positions"]
 
 
 def report(
     volume: Volume, quality: dict[str, Any], *, seconds: float, files: Iterable[Path] = ()
-) -> dict[str, Any]:
+) -> Report:
     """Sizes, quality and training of a container, as JSON values.
 
     quality: `metrics.Quality` as JSON values. seconds: duration of the whole job. files: files and
     folders that the series was read from.
-
-    Of the values returned:
-        bytes, raw_bytes: of the whole file, and of the series in its own number type.
-        split: `bytes` by what they hold, as `Container.split` has them.
-        ratio: raw_bytes / bytes.
-        source_bytes, source_ratio: of the files that were read, as they lie on disk, and their
-            ratio to `bytes`; None where there are no files.
-        psnr, rmse, max_abs_error, ssim: over the coreset of all steps, those between key frames
-            included; in dB and data units. None if the error or the range is 0.
-        psnr_bulk: over the vertices of the coreset whose original value lies in the bulk, the range
-            of the middle 98 % of its values, relative to the width of that range. None without a
-            bulk, or if the error is 0.
-        psnr_domain: over every finite vertex, with the background outside the coreset.
-        curve: the training history.
-        restarts: how often the training diverged and began again at a quarter of the learning rate.
-        tables_loss_db: dB that coded tables lose at the key frames; None for other tables.
     """
     info = volume.info
     device = info["training"]["device"]
@@ -73,7 +107,11 @@ def report(
         "ratio": info["ratio"],
         "source_bytes": source,
         "source_ratio": None if source is None else source / info["bytes"],
-        **{name: quality[name] for name in FIGURES},
+        "psnr": quality["psnr"],
+        "rmse": quality["rmse"],
+        "max_abs_error": quality["max_abs_error"],
+        "ssim": quality["ssim"],
+        "psnr_domain": quality["psnr_domain"],
         "psnr_bulk": None if quality["bulk"] is None else quality["bulk"]["psnr"],
         "seconds": seconds,
         "epochs": info["training"]["epochs"],
@@ -130,13 +168,12 @@ def steps_of_ssim(series: Series, budget: int = SSIM_BUDGET) -> list[int]:
 
 def diff(
     source: Source, path: Place, *, variable: str | None = None, progress: Progress = silent
-) -> dict[str, Any]:
+) -> Compared:
     """Decode every step of the container `path`, or at a URL, and measure it against the data.
 
     variable: which one of the container, where it has several.
 
-    Returns the figures of `report` and, as "differences", the lines of `differences`. Raises
-    InputError if the shapes differ, DamagedFileError for a damaged container.
+    Raises InputError if the shapes differ, DamagedFileError for a damaged container.
     """
     begun = time.perf_counter()
     with open_source(source) as series, open_volume(path, variable=variable) as volume:

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fhash_codec.compact.encode import DecodedTiles, code_series, encode_compact
 from fhash_codec.compact.goal import missed_promise, remarks
 from fhash_codec.compact.tiles import fits_memory
-from fhash_codec.comparison import measure, report, ssim_budget, steps_of_ssim
+from fhash_codec.comparison import EncodeReport, Sizes, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import AUTO, EncodeConfig
 from fhash_codec.dataset import Dataset
 from fhash_codec.devices import choose_device
@@ -58,7 +58,7 @@ def encode(
     progress: Progress = silent,
     predicted: Mapping[str, Any] | None = None,
     client: Any = None,
-) -> dict[str, Any]:
+) -> EncodeReport:
     """Encode a series into the container `path`, complete or not at all.
 
     source: a file (opened by `open_series` of `readers`), a Series, or an array (t, z, y, x) or
@@ -73,11 +73,11 @@ def encode(
         The source is a file that all workers see, or an array of dask, labelled or not; the
         promise is a bound of the error. See docs/scale.md.
 
-    Returns the figures of the written file (see `report`), and as "stages" what took the time (see
-    `stage_clock.Stage`). In the profile paper Ctrl-C during the
-    training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call
-    then continues from the checkpoint to the same result. In the profile compact nothing is kept:
-    KeyboardInterrupt passes through, and the same call starts again.
+    Returns the figures of the written file, and as "stages" what took the time. In the profile
+    paper Ctrl-C during the training saves a checkpoint beside `path` and raises
+    InterruptedEncodingError; the same call then continues from the checkpoint to the same result.
+    In the profile compact nothing is kept: KeyboardInterrupt passes through, and the same call
+    starts again.
 
     Raises InputError for a source or settings that cannot be encoded, or for a promise that is seen
     to be out of reach, and MissingDependencyError for CUDA without torch. Raises
@@ -105,8 +105,8 @@ def encode(
         encoded.remove_checkpoint()
     with open_volume(written) as volume:
         seconds = time.perf_counter() - begun
-        figures = report(volume, encoded.quality, seconds=seconds, files=series.files)
-    figures["stages"] = clock.to_list()
+        told = report(volume, encoded.quality, seconds=seconds, files=series.files)
+    figures: EncodeReport = {**told, "stages": clock.to_list()}
     if encoded.missed is not None:
         raise QualityError(missed_text(path, written, encoded.missed, encoded.advice), figures)
     for remark in remarks(config, figures):
@@ -122,7 +122,7 @@ def _on_cluster(
     mask: npt.ArrayLike | None,
     force: bool,
     progress: Progress,
-) -> dict[str, Any]:
+) -> EncodeReport:
     """Encode on a cluster; raises InputError for a mask, which only this process has."""
     from fhash_codec.appending.cluster import encode_on_cluster
 
@@ -365,6 +365,15 @@ Configs = EncodeConfig | Mapping[str, EncodeConfig]
 """Settings of all variables, or of each by its name."""
 
 
+class DatasetReport(Sizes):
+    """Figures of a written file of several variables.
+
+    The `bytes` of a variable are those of its own arrays, without shared coordinates and header.
+    """
+
+    variables: Annotated[dict[str, EncodeReport], "figures of each variable by name"]
+
+
 def encode_dataset(
     source: str | Path | Mapping[str, Source],
     path: str | Path,
@@ -374,7 +383,7 @@ def encode_dataset(
     open_variable: Callable[[str], Series] | None = None,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> DatasetReport:
     """Encode several variables into the container `path`, complete or not at all.
 
     They are encoded one after the other: no more is held than for the largest one alone. A single
@@ -387,10 +396,6 @@ def encode_dataset(
         `fhash info` says a command for without `--select` and the like.
     open_variable: opens a variable of a file, in place of `open_series(source, var=name)`.
     force: replace a file that exists.
-
-    Returns the figures of the written file: `path`, `bytes`, `split` (`Container.split`),
-    `raw_bytes`, `ratio`, `seconds`, and in `variables` those of each by name, as `encode` returns
-    them; their `bytes` are those of its own arrays, without shared coordinates and the header.
 
     Raises what `encode` raises, with the name of the variable. All variables are opened before the
     first is encoded. QualityError names each variable that misses its promise.
@@ -572,14 +577,14 @@ def _report(
     encoded: Mapping[str, EncodedVariable],
     stages: Mapping[str, list[dict[str, Any]]],
     seconds: float,
-) -> dict[str, Any]:
+) -> DatasetReport:
     """The figures of a written file and of each variable."""
-    figures = {}
+    figures: dict[str, EncodeReport] = {}
     with Dataset(Container.open(path)) as dataset:
         for name, volume in dataset.items():
             took = sum(stage["seconds"] for stage in stages[name])
-            figures[name] = report(volume, encoded[name].quality, seconds=took)
-            figures[name]["stages"] = stages[name]
+            told = report(volume, encoded[name].quality, seconds=took)
+            figures[name] = {**told, "stages": stages[name]}
         size, split = dataset.container.size, dataset.container.split()
     raw = sum(each["raw_bytes"] for each in figures.values())
     return {

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from fhash_codec.rendering.colour_maps import COLOUR_MAPS
+from fhash_codec.rendering.colours import COLOUR_MAPS
 from fhash_codec.simulation.simulate import simulate
 from fhash_formats.series import ArraySeries, Coordinate, Series
 from fhash_formats.support.values import Double

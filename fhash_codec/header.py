@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -40,11 +40,19 @@ from fhash_formats.container.header import (
     TOGETHER,
 )
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series, SourceMetadata, with_history
+from fhash_formats.series import (
+    AXES,
+    AXIS_NAMES,
+    Coordinate,
+    Series,
+    SourceMetadata,
+    with_history,
+)
 from fhash_formats.support.values import is_within, json_attributes
 
 if TYPE_CHECKING:
     from fhash_codec.features.scan import Scan
+    from fhash_codec.file_info import FileInfo, HistoryPoint
 
 DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
 .pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
@@ -517,11 +525,11 @@ def brief_history(
     }
 
 
-def history_points(history: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The points of a header's training history, each with seconds, epoch and psnr."""
+def history_points(history: Mapping[str, Any]) -> list[HistoryPoint]:
+    """The points of a header's training history."""
     lists = {name: history[name] for name in HISTORY if name in history}
     points = [dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=True)]
-    return [{"seconds": None, "psnr": None, **point} for point in points]
+    return [cast("HistoryPoint", {"seconds": None, "psnr": None, **point}) for point in points]
 
 
 def full_header(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[str, Any]:
@@ -574,7 +582,7 @@ def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
-def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> dict[str, Any]:
+def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> FileInfo:
     """The header of a container, and what follows from it; see `Volume.info`."""
     header = container.header
     raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize
@@ -586,14 +594,17 @@ def describe_file(container: Container, path: object, key_frames: Sequence[int])
         }
         for array in container.arrays.values()
     }
-    return {
-        **full_header(header, container.arrays),
-        "path": str(path),
-        "bytes": container.size,
-        "overhead_bytes": container.overhead(),
-        "split": container.split(),
-        "raw_bytes": raw,
-        "ratio": raw / container.size,
-        "key_frames": list(key_frames),
-        "arrays": arrays,
-    }
+    return cast(
+        "FileInfo",
+        {
+            **full_header(header, container.arrays),
+            "path": str(path),
+            "bytes": container.size,
+            "overhead_bytes": container.overhead(),
+            "split": container.split(),
+            "raw_bytes": raw,
+            "ratio": raw / container.size,
+            "key_frames": list(key_frames),
+            "arrays": arrays,
+        },
+    )

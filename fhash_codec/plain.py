@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -49,13 +49,23 @@ CHUNK_BYTES = 2 << 20
 Index = tuple[int, ...]
 
 
+class ExportReport(TypedDict):
+    """A plain file that was exported."""
+
+    path: Annotated[str, "the plain file written"]
+    bytes: Annotated[int, "its size"]
+    source_bytes: Annotated[int, "size of the file that it was made from"]
+    arrays: Annotated[int, "arrays of the plain file"]
+    values: Annotated[int, "numbers in them"]
+
+
 def export_plain(
     source: str | Path,
     path: str | Path,
     *,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> ExportReport:
     """Write the model of the container `source` in plain numbers as `path`, whole or not at all.
 
     force: replace a file that exists.
@@ -64,7 +74,6 @@ def export_plain(
     float32 or float64 where the source has corrections of floats (a bounded error). Levels of
     detail of the profile compact are there down to a lattice of 2 vertices.
 
-    Returns `path`, its `bytes`, `source_bytes`, and the number of `arrays` and of `values` in them.
     Raises InputError for a name of a data file or the source itself, OutputExistsError without
     force, and OutputError where the file cannot be written.
     """

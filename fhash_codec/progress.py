@@ -9,7 +9,7 @@ from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 Progress = Callable[[str, int, int, str], None]
 """(stage, done, total, note), e.g. ("training", 3, 20, "41.2 dB").
@@ -100,19 +100,12 @@ OTHER = "other"
 
 @dataclass(kw_only=True)
 class Stage:
-    """Record of a stage.
+    """Record of a stage."""
 
-    Attributes:
-        stage: its name.
-        seconds: wall clock time in it, without that of the stages inside.
-        times: how often it was entered; 0 for a stage that was left out.
-        why: why it ran, or was left out.
-    """
-
-    stage: str
-    seconds: float = 0.0
-    times: int = 0
-    why: str = ""
+    stage: Annotated[str, "its name"]
+    seconds: Annotated[float, "wall clock time in it, without that of the stages inside"] = 0.0
+    times: Annotated[int, "how often it was entered; 0 for a stage that was left out"] = 0
+    why: Annotated[str, "why it ran, or was left out"] = ""
 
 
 class StageClock:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,9 @@ from fhash_formats.errors import InputError, MissingDependencyError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
 from fhash_formats.transform.values import about_origin
+
+if TYPE_CHECKING:
+    from fhash_codec.file_info import FileInfo
 
 Number = int | float
 
@@ -252,11 +255,8 @@ class Volume(Card, ArrayLike):
         return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
 
     @property
-    def info(self) -> dict[str, Any]:
-        """The container's header, and what follows from it.
-
-        Added are the path, bytes, raw bytes, ratio, key frames and arrays.
-        """
+    def info(self) -> FileInfo:
+        """The container's header, and what follows from it."""
         return describe_file(self.container, self.path, self.key_times.key_frames)
 
     def verify(self, progress: Progress = silent) -> int:

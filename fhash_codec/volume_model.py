@@ -22,6 +22,7 @@ from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.values import Mask
 
 if TYPE_CHECKING:
+    from fhash_codec.file_info import CardLayer, CardOccupancy, ModelCard, Stored
     from fhash_codec.paper.model import PaperModel
 
 Positions = npt.NDArray[np.float64]
@@ -120,21 +121,14 @@ class Card:
         """
         return self._model.mlp
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> ModelCard:
         """The place of each part of the model in the file, as JSON values.
 
-        Each entry has `path` in the file, `coding` and `bytes`, which are those of the whole
-        document or array there. `path` is empty, and `bytes` 0, for what takes none of its own: a
-        coarser level that is decoded from the tiles of level 1, and an occupancy that is the whole
-        box.
-
-        Keys: `config` (with `settings`), `tables` (with `level`, `shape`, `dtype`), `mlp` (with
-        `layer`, `shape` of the weights, `activation`), `occupancy` (with `shape` of the bits,
-        and `apart`, the features that have bits of their own), and `residual` (with `shape`) where
-        a network has one.
+        `path` is empty, and `bytes` 0, for what takes none of its own: a coarser level that is
+        decoded from the tiles of level 1, and an occupancy that is the whole box.
         """
         settings = len(self.config)
-        return {
+        card: ModelCard = {
             "config": {
                 "path": "zarr.json",
                 "coding": "JSON, deflated",
@@ -152,15 +146,13 @@ class Card:
             ],
             "mlp": self._describe_mlp(),
             "occupancy": self._describe_occupancy(),
-            **({} if self._residual is None else {RESIDUAL: self._describe_residual()}),
         }
+        if self._residual is not None:
+            shape = list(self.container.arrays[RESIDUAL].shape)
+            card["residual"] = {"shape": shape, **self._stored(RESIDUAL, "")}
+        return card
 
-    def _describe_residual(self) -> dict[str, Any]:
-        """The values that the network lacks, at every vertex of the box and step."""
-        shape = list(self.container.arrays[RESIDUAL].shape)
-        return {"shape": shape, **self._stored(RESIDUAL, "")}
-
-    def _describe_mlp(self) -> list[dict[str, Any]]:
+    def _describe_mlp(self) -> list[CardLayer]:
         """The layers: in arrays of their own, all in one, or packed in the coded table."""
         count, together = len(self.mlp.weights), LAYERS in self.container.arrays
         return [
@@ -176,7 +168,7 @@ class Card:
             for number, weights in enumerate(self.mlp.weights, start=1)
         ]
 
-    def _describe_occupancy(self) -> dict[str, Any]:
+    def _describe_occupancy(self) -> CardOccupancy:
         """The bits of all key frames, or what stands in their place."""
         shape = [self.tables[0].shape[0], packed_bytes(self.box.shape)]
         arrays = self.container.arrays
@@ -195,8 +187,8 @@ class Card:
         arrays = self.container.arrays
         return arrays[TABLE].name if TABLE in arrays else TABLE
 
-    def _stored(self, name: str, otherwise: str) -> dict[str, Any]:
-        """Path, coding and bytes of an array, or of the arrays below that name."""
+    def _stored(self, name: str, otherwise: str) -> Stored:
+        """The place of an array, or of the arrays below that name."""
         stored = self.container.arrays
         found = [key for key in stored if key == name or key.startswith(f"{name}/")]
         arrays = [stored[key] for key in found]

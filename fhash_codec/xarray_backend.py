@@ -17,6 +17,7 @@ from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
 from fhash_codec.boxes import Box, index_ranges, slice_of
+from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
 from fhash_codec.dataset import Handle, absolute, acquire, release
 from fhash_codec.encoding import encode
@@ -500,7 +501,7 @@ def _encode(
     force: bool,
     client: Any,
     settings: Mapping[str, Any],
-) -> dict[str, Any]:
+) -> EncodeReport:
     if config is not None and settings:
         raise InputError(f"give either config or single settings, not both: {', '.join(settings)}")
     chosen = config or EncodeConfig.from_dict(dict(settings))
@@ -523,7 +524,7 @@ class DatasetAccessor:
         force: bool = False,
         client: Any = None,
         **settings: Any,
-    ) -> dict[str, Any]:
+    ) -> EncodeReport:
         """Encode a variable, the only one that can be by default; as `fhash_codec.encode` does.
 
         settings: fields of `EncodeConfig`, such as psnr=45.
@@ -546,6 +547,6 @@ class DataArrayAccessor:
         force: bool = False,
         client: Any = None,
         **settings: Any,
-    ) -> dict[str, Any]:
+    ) -> EncodeReport:
         """Encode the array as `fhash_codec.encode` does; settings: fields of `EncodeConfig`."""
         return _encode(self._array, path, None, config, force, client, settings)

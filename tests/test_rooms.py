@@ -48,6 +48,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("native", "paraview_reader", "progress", "records"),
         ("boxes", "config", "devices", "measure"),
         ("features",),
+        ("file_info",),
         ("header",),
         ("compact",),
         ("paper",),
@@ -65,7 +66,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "fhash_codec.appending": (("growing", "series_plan"), ("parts", "writer"), ("cluster",)),
     "fhash_codec.rendering": (
-        ("scenes", "colour_maps", "grid"),
+        ("scenes", "grid"),
         ("cameras", "colours"),
         ("transfer_function", "view"),
         ("march_task",),

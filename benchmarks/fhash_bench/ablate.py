@@ -288,7 +288,7 @@ class AblateBench:
     """Figures of all axes.
 
     Attributes:
-        series: name of the series; `shape` (t, z, y, x) and `features` are what was encoded.
+        series: name of the series. shape: (t, z, y, x). features: what was encoded.
         common: settings of all encodings of a profile.
         runs: all encodings.
         left_out: a line for each variation that was not measured, with the reason.

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from statistics import median
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import torch
@@ -272,6 +272,38 @@ class Slices:
             self.cpu.append(samples / spent.on("cpu"))
 
 
+class Reached(TypedDict):
+    """When a training first reached a quality."""
+
+    psnr: Annotated[float, "dB"]
+    seconds: Annotated[float | None, "that passed; null where it was not reached"]
+    cpu_seconds: Annotated[float | None, "of processors"]
+
+
+class EngineFigures(TypedDict):
+    """Figures of an engine, medians over the turns."""
+
+    engine: Annotated[str, "its name"]
+    threads: Annotated[int, "threads that it computed with"]
+    path: Annotated[str | None, "instructions that the native engine used; null for the others"]
+    train_msamples_s: Annotated[float, "training, 10^6 samples a second that passed"]
+    train_msamples_cpu_s: Annotated[float, "the same, a second of processors"]
+    train_ratio: Annotated[float | None, "times that of `slab` in as many threads"]
+    infer_msamples_s: Annotated[float, "evaluation, 10^6 samples a second that passed"]
+    infer_msamples_cpu_s: Annotated[float, "the same, a second of processors"]
+    infer_ratio: Annotated[float | None, "times that of `slab`"]
+    thread_ratio: Annotated[float | None, "training, over that of one thread"]
+    fraction_of_peak: Annotated[float, "three products of the network over the peak"]
+    infer_fraction_of_peak: Annotated[float, "one product, in evaluation"]
+    fraction_of_bandwidth: Annotated[float, "bytes that training moves at least, over a copy"]
+    psnr: Annotated[float | None, "dB on some bricks of the coreset; null for an exact model"]
+    epochs: Annotated[float, "that it reached"]
+    seconds: Annotated[float, "of training that passed"]
+    cpu_seconds: Annotated[float, "of training, of processors"]
+    seconds_to: Annotated[list[Reached], "when it first reached a quality"]
+    curve: Annotated[list[dict[str, Any]], list[CurvePoint], "its quality after each turn"]
+
+
 class EngineRun:
     """One engine in training on a coreset.
 
@@ -388,7 +420,7 @@ class EngineRun:
         }
 
 
-def _reached(curve: list[CurvePoint], goal: float) -> dict[str, float | None]:
+def _reached(curve: list[CurvePoint], goal: float) -> Reached:
     """Return when a curve reached a quality in dB."""
     point = seconds_to(curve, goal)
     return {

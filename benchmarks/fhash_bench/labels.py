@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -268,6 +268,14 @@ class LabelSize:
         return self.fhash_bytes / self.xz_bytes
 
 
+class LabelReport(TypedDict):
+    """Figures of all series, as JSON values."""
+
+    kinds: Annotated[list[dict[str, Any]], list[LabelSize], "each series, the worst ratio first"]
+    machine: Annotated[dict[str, Any], "date, command line, processor, load, versions and more"]
+    notes: Annotated[list[str], "how it was measured"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class LabelBench:
     """Figures of all series, the worst ratio first."""
@@ -276,7 +284,7 @@ class LabelBench:
     machine: dict[str, Any]
     notes: tuple[str, ...] = NOTES
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> LabelReport:
         """JSON values."""
         return {
             "kinds": [asdict(size) | {"ratio": size.ratio} for size in self.sizes],

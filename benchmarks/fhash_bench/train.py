@@ -9,13 +9,13 @@ from dataclasses import replace
 from math import prod
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from fhash_bench.engines import GOALS, EngineRun, Peaks, Variant, now
+from fhash_bench.engines import GOALS, EngineFigures, EngineRun, Peak, Peaks, Variant, now
 from fhash_bench.rate.generated import DEFAULT, is_made, made_series
 from fhash_codec.boxes import Box, TableSource
 from fhash_codec.config import ENGINES, EncodeConfig
@@ -45,14 +45,22 @@ POINT_TURNS = 2
 Points = npt.NDArray[np.float64]
 
 
+class PointRate(TypedDict):
+    """Rate of queries at points of one time, the tables read included."""
+
+    order: Annotated[str, "`rays`, one after the other, or `random`"]
+    gradient: Annotated[bool, "whether the derivatives were computed too"]
+    threads: Annotated[int, "threads"]
+    mpoints_s: Annotated[float, "10^6 points a second that passed"]
+    mpoints_cpu_s: Annotated[float, "the same, a second of processors"]
+
+
 def bench_points(
     architecture: Architecture, layers: Sequence[Layer], threads: Sequence[int]
-) -> list[dict[str, Any]]:
+) -> list[PointRate]:
     """Measure `sample_points` at one time between two key frames, reading the tables included.
 
-    The embeddings are random: the time does not depend on them. Each entry has `order` (`rays` or
-    `random`), `gradient`, `threads`,
-    `mpoints_s` and `mpoints_cpu_s`, 10^6 points a second that passed and of processors.
+    The embeddings are random: the time does not depend on them.
 
     Args:
         architecture: the sizes of the network.
@@ -66,7 +74,7 @@ def bench_points(
     ]
     network = _network(architecture, layers, tables)
     time = 0.37 * (network.key_frames - 1)
-    results = []
+    results: list[PointRate] = []
     for order, places in (("rays", _rays(network)), ("random", _random(network))):
         for gradient in (False, True):
             for number in threads:
@@ -140,19 +148,22 @@ class _ZeroTable:
         return np.zeros([axis.stop - axis.start for axis in region], np.float32)
 
 
+class DecodeRate(TypedDict):
+    """Rate of decoding the coreset; medians over the turns."""
+
+    decode_msamples_s: Annotated[float, "decoding of the coreset, 10^6 vertices a second"]
+    decode_ratio: Annotated[float, "times as fast as the whole box, evaluated in the same run"]
+
+
 def bench_decode(
     architecture: Architecture, coreset: Coreset, layers: Sequence[Layer]
-) -> dict[str, float]:
+) -> DecodeRate:
     """Measure the decoding of key frames: of their coreset alone, and of the whole box, in turns.
 
     Args:
         architecture: the sizes of the model.
         coreset: the coreset, whose occupancy is decoded.
         layers: weight and bias of each layer.
-
-    Returns:
-        `decode_msamples_s`, 10^6 vertices of the coreset a second, and `decode_ratio`, how many
-        times as fast as the whole box; medians over the turns.
     """
     size = architecture.embedding_size
     tables = [_ZeroTable((*level, size)) for level in architecture.levels]
@@ -185,6 +196,34 @@ INFER_SECONDS = 0.12
 """Seconds of evaluation in each turn."""
 
 
+class TrainSeries(DecodeRate):
+    """Figures of a series."""
+
+    series: Annotated[str, "source and variable"]
+    features: Annotated[list[str], "the features"]
+    samples: Annotated[int, "vertices of the coreset"]
+    sample_bytes: Annotated[int, "size of their values"]
+    parameters: Annotated[int, "trained numbers of the model"]
+    float16_bytes: Annotated[int, "their size as float16, without further coding"]
+    batch_samples: Annotated[float, "samples of a batch, the mean"]
+    batch_bricks: Annotated[float, "bricks of a batch, the mean"]
+    brick_fill: Annotated[float, "share of samples among the vertices of bricks, 0 to 1"]
+    engines: Annotated[list[dict[str, Any]], list[EngineFigures], "each engine"]
+    points: Annotated[list[PointRate], "queries at points of one time, the tables read included"]
+
+
+class TrainBench(TypedDict):
+    """Figures of engines.
+
+    Seconds of processors are those of all threads of the program together. On a GPU, rates and
+    shares are by the time that passes, and peaks by events of the device.
+    """
+
+    machine: Annotated[dict[str, Any], "date, command line, processor, load, versions and more"]
+    peaks: Annotated[list[dict[str, Any]], list[Peak], "of one thread"]
+    series: Annotated[list[TrainSeries], "with features and whole, for each number of bricks"]
+
+
 def bench_train(
     source: Source | None = None,
     config: EncodeConfig | None = None,
@@ -194,15 +233,14 @@ def bench_train(
     bricks: Sequence[int] = (),
     whole: bool = True,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> TrainBench:
     """Measure engines on the coreset of a series.
 
     A series with a feature is measured a second time without it: bricks around a feature are
     partly empty. Each engine trains for `seconds` in turns with the others, evaluates samples in
     each turn, and its quality is measured after each. It does so in one thread, and in as many as
     there are; the native engine in one thread for each of the processor's instructions, too. The
-    learning rate falls to zero over each engine's own seconds. docs/json.md says what the result
-    holds.
+    learning rate falls to zero over each engine's own seconds.
 
     Args:
         source: the series, or `generated:NAME` for one of `MADE`; None for a blast's shell.
@@ -257,7 +295,7 @@ def _measured(
     bricks: int,
     peaks: Peaks,
     progress: Progress,
-) -> dict[str, Any]:
+) -> TrainSeries:
     """Return an entry of `series`; arguments as in `bench_train`, `bricks` of one step."""
     device, selected = peaks.device, select(series, config, progress)
     coreset, architecture = selected.coreset, selected.architecture
@@ -364,7 +402,7 @@ CLOCKS = {"cpu_seconds": "seconds of processors", "seconds": "seconds that passe
 """Axes of time, by the key of a curve's points."""
 
 
-def plot(result: dict[str, Any], path: Path) -> None:
+def plot(result: TrainBench, path: Path) -> None:
     """Draw a result of `bench_train` as a PNG at `path`: a row for each entry, a panel a clock."""
     figure_module = require_matplotlib()
     entries = result["series"]
@@ -387,7 +425,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure.savefig(path, format="png")
 
 
-def _curves(panel: Any, entry: dict[str, Any], clock: str) -> None:
+def _curves(panel: Any, entry: TrainSeries, clock: str) -> None:
     """Draw a line for each engine that was measured."""
     drawn: dict[str, int] = {}
     for run in entry["engines"]:

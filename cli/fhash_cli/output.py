@@ -11,7 +11,7 @@ import time
 import unicodedata
 from collections.abc import Mapping, Sequence
 from contextvars import ContextVar
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO, TypedDict
 
 import click
 
@@ -274,8 +274,16 @@ def print_json(values: Mapping[str, Any]) -> None:
     printed.set(True)
 
 
-def error_object(error: Exception) -> dict[str, Any]:
-    """An error as JSON: what went wrong in one line, its kind and the exit code."""
+class ErrorObject(TypedDict):
+    """An error as JSON."""
+
+    error: Annotated[str, "one line, as on stderr"]
+    kind: Annotated[str, "a word for it, see Errors"]
+    exit_code: Annotated[int, "exit code of the process"]
+
+
+def error_object(error: Exception) -> ErrorObject:
+    """An error as JSON."""
     line, code = describe_error(error)
     return {"error": line, "kind": _kind(error, code), "exit_code": code}
 

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from fhash_codec.appending.parts import Part, encode_part, join_parts
 from fhash_codec.appending.series_plan import SeriesPlan, bounded
 from fhash_codec.compact.tiles import fits_memory
-from fhash_codec.comparison import report
+from fhash_codec.comparison import EncodeReport, report
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import InTime, parse_feature
 from fhash_codec.features.scan import Scan, SpanScan
@@ -63,7 +63,7 @@ def encode_on_cluster(
     *,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> EncodeReport:
     """Encode a series on the workers of a dask client; see `fhash_codec.encode`.
 
     source: a file that all workers see, or a labelled or plain array of dask. The client reads the

@@ -12,7 +12,7 @@ from functools import cached_property
 from itertools import islice, product
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Annotated, Any, NamedTuple, TypedDict, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from fhash_codec.appending.series_plan import SeriesPlan, bounded, code_layers
 from fhash_codec.compact.encode import all_tiles
 from fhash_codec.compact.tiles import Blocks, CodedTiles
-from fhash_codec.comparison import measure, report, ssim_budget, steps_of_ssim
+from fhash_codec.comparison import Report, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Extent, packed_masks, resolve_features
 from fhash_codec.features.scan import Scan, scan_steps
@@ -103,7 +103,7 @@ def encode_part(
     plan: SeriesPlan | None = None,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> Report:
     """Encode one part of a series; `merge` makes one file of all of them.
 
     The arguments are those of `encode`; the promise is a bound of the error, and times are not
@@ -113,8 +113,8 @@ def encode_part(
         the part are read. It has the settings; those of `config` must be the same, if given. The
         part plans the whole series by itself if None.
 
-    Returns the figures of the written file (`report`). Raises what `encode` raises, and InputError
-    for a promise that no part alone can keep and for a plan of other data or settings.
+    Raises what `encode` raises, and InputError for a promise that no part alone can keep and for a
+    plan of other data or settings.
     """
     path = Path(path)
     config = _settings(config, plan)
@@ -314,27 +314,46 @@ OWN_VARIABLE = ("fill", NOT_STORED)
 """Keys of its variable that do: of values that some steps alone have."""
 
 
+class MergeReport(TypedDict):
+    """A file that was joined of parts."""
+
+    path: Annotated[str, "the file written"]
+    bytes: Annotated[int, "its size"]
+    parts: Annotated[int, "files that were joined"]
+    steps: Annotated[int, "its steps"]
+    tiles: Annotated[int, "tiles that were copied"]
+    psnr: Annotated[float | None, "dB over all steps"]
+    rmse: Annotated[float | None, "root of the mean squared error, in data units"]
+    max_abs_error: Annotated[float | None, "largest error, in data units"]
+
+
 def merge(
     paths: Sequence[str | Path],
     output: str | Path,
     *,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> MergeReport:
     """Join the parts of a series, given in any order, to the container `output`.
 
     paths: files of `encode_part`, or `fhash encode --part`. Tiles are copied, and checked by their
     checksums; none is coded again. The result is, byte for byte, the file of one encoding with the
     same settings and `timings=False`.
 
-    Returns path, bytes, parts, steps and tiles; psnr, rmse and max_abs_error over all steps. Raises
-    InputError for files that are no parts or not of one encoding, for gaps and overlaps;
+    Raises InputError for files that are no parts or not of one encoding, for gaps and overlaps;
     DamagedFileError for damaged ones; OutputExistsError and OutputError.
     """
     joined = join_parts(paths, output, force=force, progress=progress)
-    figures = {name: joined.quality[name] for name in ("psnr", "rmse", "max_abs_error")}
-    counted = {"parts": joined.parts, "steps": joined.steps, "tiles": joined.tiles}
-    return {"path": str(output), "bytes": joined.size, **counted, **figures}
+    return {
+        "path": str(output),
+        "bytes": joined.size,
+        "parts": joined.parts,
+        "steps": joined.steps,
+        "tiles": joined.tiles,
+        "psnr": joined.quality["psnr"],
+        "rmse": joined.quality["rmse"],
+        "max_abs_error": joined.quality["max_abs_error"],
+    }
 
 
 class Joined(NamedTuple):

@@ -10,7 +10,7 @@ from dataclasses import replace
 from math import prod
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -424,9 +424,22 @@ def _positions(
     return result
 
 
+class AppendReport(TypedDict):
+    """A file that steps were appended to."""
+
+    path: Annotated[str, "the file"]
+    bytes: Annotated[int, "its size"]
+    steps: Annotated[int, "its steps"]
+    kept: Annotated[int, "those that it had before and keeps"]
+    appended: Annotated[int, "those that are new"]
+    psnr: Annotated[float | None, "dB over all steps"]
+    rmse: Annotated[float | None, "root of the mean squared error, in data units"]
+    max_abs_error: Annotated[float | None, "largest error, in data units"]
+
+
 def append(
     source: Source, path: str | Path, *, keep: int | None = None, progress: Progress = silent
-) -> dict[str, Any]:
+) -> AppendReport:
     """Append the steps of a series to the file `path`, in its tiles, settings and bound.
 
     source: a file, a Series or an array, as `encode` takes it: of the number type and the shape
@@ -434,9 +447,8 @@ def append(
         neither has times, steps are counted on.
     keep: number of steps of the file to keep, whole layers; all if None.
 
-    Returns path, bytes, steps, and of these kept and appended; psnr, rmse and max_abs_error over
-    all steps. The file is replaced by the longer one at the end, or stays as it was. Raises
-    InputError for a file that cannot grow and for steps that do not fit.
+    The file is replaced by the longer one at the end, or stays as it was. Raises InputError for a
+    file that cannot grow and for steps that do not fit.
     """
     path = Path(path)
     with open_source(source) as series:
@@ -451,10 +463,17 @@ def append(
             growing.publish()
             steps = growing.steps
     with open_volume(path) as volume:
-        info = volume.info
-        figures = {name: info["quality"].get(name) for name in ("psnr", "rmse", "max_abs_error")}
-    counted = {"steps": steps, "kept": kept, "appended": steps - kept}
-    return {"path": str(path), "bytes": info["bytes"], **counted, **figures}
+        size, quality = volume.container.size, volume.container.header["quality"]
+    return {
+        "path": str(path),
+        "bytes": size,
+        "steps": steps,
+        "kept": kept,
+        "appended": steps - kept,
+        "psnr": quality.get("psnr"),
+        "rmse": quality.get("rmse"),
+        "max_abs_error": quality.get("max_abs_error"),
+    }
 
 
 def _add(

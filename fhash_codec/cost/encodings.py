@@ -11,7 +11,7 @@ from math import prod
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -279,28 +279,25 @@ PLACES = 5
 
 @dataclass(frozen=True, kw_only=True)
 class ModelPrice:
-    """Price of one model, from a crop; bytes and seconds are foretold for the whole series.
+    """Price of one model, from a crop; bytes and seconds are foretold for the whole series."""
 
-    Attributes:
-        profile: of the model.
-        bytes: of the file.
-        seconds: of the encoding.
-        region_ms: milliseconds of a region of 16^3 of a file that is just opened.
-        picture_ms: milliseconds of a first picture of 256 x 256 of the crop.
-        psnr: in dB over the crop.
-        between: PSNR in dB at every other step of the crop, of a file without them; None where
-            there are too few steps.
-        kept: whether the promise is kept.
-    """
+    profile: Annotated[str, "of the model"]
+    bytes: Annotated[int, "of the file, foretold"]
+    seconds: Annotated[float, "of the encoding, foretold"]
+    region_ms: Annotated[float, "milliseconds of a region of 16^3 of a file that is just opened"]
+    picture_ms: Annotated[float, "milliseconds of a first picture of 256 x 256 of the crop"]
+    psnr: Annotated[float | None, "in dB over the crop"]
+    between: Annotated[float | None, "dB at every other step, of a file without them"]
+    kept: Annotated[bool, "whether the promise is kept"]
 
-    profile: str
-    bytes: int
-    seconds: float
-    region_ms: float
-    picture_ms: float
-    psnr: float | None
-    between: float | None
-    kept: bool
+
+class ModelsCompared(TypedDict):
+    """The choice between both models, as JSON values."""
+
+    chosen: Annotated[str, "`compact` or `paper`"]
+    why: Annotated[str, "why"]
+    crop: Annotated[str, "the part of the series that both were fitted to; empty without a choice"]
+    prices: Annotated[list[dict[str, Any]], list[ModelPrice], "what each costs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,7 +316,7 @@ class ModelChoice:
     crop: str
     why: str
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> ModelsCompared:
         """The choice as JSON values."""
         return {
             "chosen": self.config.profile,

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import prod
-from typing import Any
+from typing import Annotated, TypedDict
 
 import numpy as np
 
@@ -571,6 +571,26 @@ PROBED = 0.4
 """Share of the budget after which no further effort is probed."""
 
 
+class Predicted(TypedDict):
+    """A prediction of an encoding, as JSON values."""
+
+    seconds: Annotated[float, "of the encoding, without the predictions"]
+    bytes: Annotated[int | None, "of the file"]
+    psnr: Annotated[float | None, "in dB over the coreset"]
+    basis: Annotated[str, "what the prediction rests on, and how uncertain it is"]
+
+
+class TimeBudget(TypedDict):
+    """The choice of effort or epochs by a time budget, as JSON values."""
+
+    seconds: Annotated[float, "the budget"]
+    probing_seconds: Annotated[float, "of it, what the predictions took"]
+    chosen: Annotated[str, "the option that was chosen, such as `--effort 3`"]
+    why: Annotated[str, "why"]
+    fits: Annotated[bool, "whether the encoding was predicted to fit"]
+    predicted: Annotated[Predicted, "what was predicted"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Choice:
     """Settings that were chosen by a time budget.
@@ -596,8 +616,8 @@ class Choice:
         """The option that was chosen, as the command line takes it."""
         return _option(self.config)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The choice as JSON values; see docs/json.md."""
+    def to_dict(self) -> TimeBudget:
+        """The choice as JSON values."""
         told = self.prediction
         return {
             "seconds": self.seconds,

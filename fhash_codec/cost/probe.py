@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
@@ -40,6 +39,7 @@ from fhash_codec.compact.stages import first_guess, first_settings
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, code, total
 from fhash_codec.compact.transform import likely_transform, tile_costs, usual_transform
+from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
 from fhash_codec.features.bricks import BRICK_BITS
@@ -482,7 +482,7 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     )
     domain = prod(part.shape[1:]) * len(report["key_frames"])
     samples = max(1, round(report["coreset_fraction"] * domain / share))
-    first, last = (point["seconds"] for point in (report["curve"][0], report["curve"][-1]))
+    first, last = (point["seconds"] or 0.0 for point in (report["curve"][0], report["curve"][-1]))
     bricks = max(1, round(vertices / share) >> sum(BRICK_BITS))
     batches_here = usual_batches(
         round(samples * share), max(1, round(bricks * share)), config.batch
@@ -503,13 +503,13 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     )
 
 
-def _encoded(part: Series, config: EncodeConfig) -> dict[str, Any]:
+def _encoded(part: Series, config: EncodeConfig) -> EncodeReport:
     """The report of an encoding into a file that is thrown away."""
     with TemporaryDirectory() as folder:
         return reported(part, Path(folder) / "part.fhz", config)[0]
 
 
-def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
+def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[EncodeReport, bool]:
     """The report of an encoding, without warnings, and whether it keeps its promise."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FhashWarning)

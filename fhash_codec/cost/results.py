@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from fhash_codec.file_info import HistoryPoint
+from fhash_codec.measure.errors import StepErrors
+
 OWN = ("compact", "paper")
 """Codecs of this package; the others are peers."""
 
@@ -61,10 +64,14 @@ class Encoded:
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """The course of one training: points of {seconds, epoch, psnr}, psnr in dB on samples."""
+    """The course of one training.
+
+    Attributes:
+        name: the encoding. points: the course.
+    """
 
     name: str
-    points: tuple[dict[str, float | None], ...]
+    points: tuple[HistoryPoint, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +95,7 @@ class Gain:
     """The size of a compact file after a part of the search, estimated but for the last.
 
     Attributes:
+        what: the part. bytes: the size.
         seconds: since the search began; None where the file does not tell.
     """
 
@@ -168,7 +176,11 @@ class Advice:
 
 @dataclass(frozen=True, kw_only=True)
 class LeftOut:
-    """A thing that was not measured, and why; late: whether time alone was wanting."""
+    """A thing that was not measured.
+
+    Attributes:
+        what: what. why: why. late: whether time alone was wanting.
+    """
 
     what: str
     why: str
@@ -181,6 +193,7 @@ class CostReport:
 
     Attributes:
         series: source and variable. shape: (t, z, y, x) of the whole series.
+        units: of the values; may be empty. dtype: number type.
         measured: the part that was measured, in words. measured_shape: its shape.
         raw_bytes: of the measured part.
         value_range: smallest and largest value of it.
@@ -207,7 +220,7 @@ class CostReport:
     curves: tuple[Curve, ...] = ()
     stages: tuple[Stage, ...] = ()
     gains: tuple[Gain, ...] = ()
-    per_step: tuple[dict[str, Any], ...] = ()
+    per_step: tuple[StepErrors, ...] = ()
     reads: tuple[Read, ...] = ()
     pictures: tuple[Picture, ...] = ()
     advice: tuple[Advice, ...] = ()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -259,19 +259,22 @@ def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> 
     return difference
 
 
+class StepErrors(TypedDict):
+    """Figures of a step; null if no vertex is counted, the PSNR also if the error or range is 0."""
+
+    step: Annotated[int, "index of the step"]
+    psnr: Annotated[float | None, "in dB"]
+    rmse: Annotated[float | None, "in data units"]
+    max_abs_error: Annotated[float | None, "in data units"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class BulkQuality:
-    """Figures over the counted vertices whose original value lies in the bulk of the series.
+    """Figures over the counted vertices whose original value lies in the bulk of the series."""
 
-    Attributes:
-        psnr: in dB, relative to the width of the bulk; None if the error is 0.
-        rmse: in data units; None if no such vertex is counted.
-        range: first and last value of the bulk, in data units.
-    """
-
-    psnr: float | None
-    rmse: float | None
-    range: tuple[float, float]
+    psnr: Annotated[float | None, "dB, relative to the width of the bulk; null if the error is 0"]
+    rmse: Annotated[float | None, "in data units; null if no such vertex is counted"]
+    range: Annotated[tuple[float, float], "first and last value of the bulk, in data units"]
 
 
 class Errors:
@@ -339,11 +342,8 @@ class Errors:
             sums = ErrorSums.of(np.add.accumulate(both)[-1])
         self._sums = sums._replace(largest=float(both[:, 2].max()))
 
-    def per_step(self) -> list[dict[str, Any]]:
-        """Figures of each step: `step`, `psnr` in dB, `rmse` and `max_abs_error` in data units.
-
-        They are None if no vertex is counted, the PSNR as well if the error or the range is 0.
-        """
+    def per_step(self) -> list[StepErrors]:
+        """Figures of each step."""
         sums = (row for errors in self.sums for row in errors[:, :3].tolist())
         return [
             {

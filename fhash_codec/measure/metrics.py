@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import pairwise, product
 from math import prod
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from fhash_codec import native
 from fhash_codec.measure.errors import (
     BulkQuality,
     Errors,
+    StepErrors,
     pointer,
     range_and_sum,
 )
@@ -194,23 +195,14 @@ def _weights() -> Double:
 
 @dataclass(frozen=True, kw_only=True)
 class BetweenQuality:
-    """PSNR in dB over parts of the coreset; None if a part is empty or its error is 0.
+    """PSNR in dB over parts of the coreset; None if a part is empty or its error is 0."""
 
-    Attributes:
-        psnr_key_frames: at the steps that are key frames.
-        psnr: at the other steps.
-        psnr_linear: there, of the source interpolated linearly in time between its key frames.
-        psnr_fringe: there, at vertices in the coreset of only one of the two key frames around.
-        psnr_fringe_linear: there, of the interpolated source.
-        fringe_fraction: share of these vertices in the coreset of those steps.
-    """
-
-    psnr_key_frames: float | None
-    psnr: float | None
-    psnr_linear: float | None
-    psnr_fringe: float | None
-    psnr_fringe_linear: float | None
-    fringe_fraction: float
+    psnr_key_frames: Annotated[float | None, "at the steps that are key frames"]
+    psnr: Annotated[float | None, "at the other steps"]
+    psnr_linear: Annotated[float | None, "there, of the source interpolated linearly"]
+    psnr_fringe: Annotated[float | None, "there, where only one of the key frames around is kept"]
+    psnr_fringe_linear: Annotated[float | None, "there, of the interpolated source"]
+    fringe_fraction: Annotated[float, "share of these vertices at those steps"]
 
 
 class Neighbours(NamedTuple):
@@ -344,30 +336,19 @@ VERTICES_HELD = 1 << 24
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """Figures of a series; None if no vertex is counted or a figure has no finite value.
+    """Figures of a series; None if no vertex is counted or a figure has no finite value."""
 
-    Attributes:
-        psnr, rmse, max_abs_error: over the coreset of all steps, in dB and data units.
-        bulk: over the part of it whose values are the bulk; None without a bulk.
-        ssim: mean over the coreset of the measured steps.
-        ssim_window: sigma and window of the SSIM in vertices, the data range and measured steps.
-        psnr_domain, rmse_domain, max_abs_error_domain: over all vertices, with the background as
-            the decoded value outside the coreset.
-        per_step: figures over the coreset of each step, see `Errors.per_step`.
-        between: at key frames and between them; None if every step is a key frame.
-    """
-
-    psnr: float | None
-    rmse: float | None
-    max_abs_error: float | None
-    bulk: BulkQuality | None
-    ssim: float | None
-    ssim_window: dict[str, Any]
-    psnr_domain: float | None
-    rmse_domain: float | None
-    max_abs_error_domain: float | None
-    per_step: list[dict[str, Any]]
-    between: BetweenQuality | None = None
+    psnr: Annotated[float | None, "dB over the coreset of all steps"]
+    rmse: Annotated[float | None, "over the coreset of all steps"]
+    max_abs_error: Annotated[float | None, "over the coreset of all steps"]
+    bulk: Annotated[BulkQuality | None, "over the middle 98 % of the values; null without such"]
+    ssim: Annotated[float | None, "mean over the coreset of the measured steps"]
+    ssim_window: Annotated[dict[str, Any], "sigma and window in vertices, range and steps"]
+    psnr_domain: Annotated[float | None, "dB over all, background outside the coreset"]
+    rmse_domain: Annotated[float | None, "likewise"]
+    max_abs_error_domain: Annotated[float | None, "likewise"]
+    per_step: Annotated[list[StepErrors], "figures over the coreset of each step"]
+    between: Annotated[BetweenQuality | None, "null if every step is a key frame"] = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -295,21 +295,13 @@ PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 
 @dataclass(frozen=True, kw_only=True)
 class Animated:
-    """Result of `animate`.
+    """Result of `animate`."""
 
-    Attributes:
-        paths: files that are now there.
-        rendered: number of pictures that were rendered.
-        kept: number of pictures that were there already.
-        counters: sums of the counters of the rendered pictures.
-        seconds: time of the whole job.
-    """
-
-    paths: tuple[Path, ...]
-    rendered: int
-    kept: int
-    counters: dict[str, int]
-    seconds: float
+    paths: Annotated[tuple[Path, ...], "files that are now there"]
+    rendered: Annotated[int, "number of pictures that were rendered"]
+    kept: Annotated[int, "number of pictures that were there already"]
+    counters: Annotated[dict[str, int], "sums of the counters of the rendered pictures"]
+    seconds: Annotated[float, "time of the whole job"]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""

@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Annotated, TypedDict, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -230,41 +230,52 @@ def _span(feature: Feature, low: float, high: float) -> tuple[float, float]:
     return low if feature.threshold is None else max(feature.threshold, low), high
 
 
-def follow(
-    volume: Volume, tracked: Sequence[Tracked], steps: Sequence[float]
-) -> list[dict[str, Any]]:
-    """Find where each feature is at each step.
+class PlaceOfFeature(TypedDict):
+    """A feature at a step, in physical coordinates."""
 
-    Returns:
-        For each feature {feature, colour, steps: [{step, time, vertices, centroid, bounds}]}.
-        `vertices` is their number, `centroid` (x, y, z) their mean in physical coordinates,
-        `bounds` ((x, x), (y, y), (z, z)) their first and last positions. The last two are None
-        where the feature has no vertex.
-    """
+    step: Annotated[float, "the step"]
+    time: Annotated[float, "its physical time"]
+    vertices: Annotated[int, "their number"]
+    centroid: Annotated[list[float] | None, "their mean (x, y, z); null without a vertex"]
+    bounds: Annotated[list[list[float]] | None, "first and last position along x, y and z"]
+
+
+class Followed(TypedDict):
+    """A feature that was followed."""
+
+    feature: Annotated[str, "as `--feature` takes it"]
+    colour: Annotated[str, "its colour, `#rrggbb` or a name"]
+    steps: Annotated[list[PlaceOfFeature], "where it is at each step"]
+
+
+def follow(volume: Volume, tracked: Sequence[Tracked], steps: Sequence[float]) -> list[Followed]:
+    """Find where each feature is at each step."""
     times = volume.coords["t"].values
     axes = [volume.coords[axis].values for axis in "xyz"]
-    places: list[list[dict[str, Any]]] = [[] for _ in tracked]
+    places: list[list[PlaceOfFeature]] = [[] for _ in tracked]
     for step in steps:
         frame = volume.read(step)
         time = float(np.interp(step, np.arange(len(times)), times))
         for item, items_places in zip(tracked, places, strict=True):
             selected = np.asarray(item.feature.select(frame, int(step)))
-            items_places.append({"step": float(step), "time": time, **_extent(selected, axes)})
+            items_places.append(_place(float(step), time, selected, axes))
     return [
         {"feature": str(item.feature), "colour": item.colour, "steps": items_places}
         for item, items_places in zip(tracked, places, strict=True)
     ]
 
 
-def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Double]) -> dict[str, Any]:
-    """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
+def _place(
+    step: float, time: float, selected: npt.NDArray[np.bool_], axes: Sequence[Double]
+) -> PlaceOfFeature:
+    """The place of the selected vertices (z, y, x) at coordinates x, y, z."""
     indices = np.nonzero(selected)[::-1]
     count = len(indices[0])
-    if not count:
-        return {"vertices": 0, "centroid": None, "bounds": None}
     positions = [axis[index] for axis, index in zip(axes, indices, strict=True)]
     return {
+        "step": step,
+        "time": time,
         "vertices": count,
-        "centroid": [float(axis.mean()) for axis in positions],
-        "bounds": [[float(axis.min()), float(axis.max())] for axis in positions],
+        "centroid": [float(axis.mean()) for axis in positions] if count else None,
+        "bounds": [[float(axis.min()), float(axis.max())] for axis in positions] if count else None,
     }

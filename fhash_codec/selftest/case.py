@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,21 +24,13 @@ threads."""
 
 @dataclass(frozen=True)
 class Finding:
-    """A property of a case, measured. It holds if `worst` is at most `limit`; NaN does not hold.
+    """A property of a case, measured. It holds if `worst` is at most `limit`; NaN does not hold."""
 
-    Attributes:
-        name: name of the property.
-        worst: the largest figure that was measured.
-        limit: the largest figure that is allowed.
-        unit: unit of both figures, such as 'values', 'of the bound', 'of the range' or 'dB'.
-        under: the settings or engine that gave the figure.
-    """
-
-    name: str
-    worst: float
-    limit: float
-    unit: str
-    under: str = ""
+    name: Annotated[str, "name of the property"]
+    worst: Annotated[float, float | str, "the largest figure; a text where it is not finite"]
+    limit: Annotated[float, float | str, "the largest figure that is allowed"]
+    unit: Annotated[str, "unit of both"]
+    under: Annotated[str, "the settings or engine that gave the figure"] = ""
 
     def __post_init__(self) -> None:
         """Make a count a figure."""

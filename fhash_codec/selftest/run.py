@@ -14,7 +14,7 @@ from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -49,23 +49,14 @@ def relative(finding: Finding) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseResult:
-    """The results of one case.
+    """The results of one case."""
 
-    Attributes:
-        name: name of the case.
-        group: its group.
-        about: one line that says what is hard.
-        under: names of the settings that were tried.
-        findings: the findings under all settings, each with the name of its settings in `under`.
-        errors: one line for each error that kept the case, or a check of it, from finishing.
-    """
-
-    name: str
-    group: str
-    about: str
-    under: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    errors: tuple[str, ...] = ()
+    name: Annotated[str, "name of the case"]
+    group: Annotated[str, "its group"]
+    about: Annotated[str, "one line that says what is hard"]
+    under: Annotated[tuple[str, ...], "names of the settings that were tried"] = ()
+    findings: Annotated[tuple[Finding, ...], "its figures under all settings"] = ()
+    errors: Annotated[tuple[str, ...], "what kept it from finishing"] = ()
 
     @property
     def holds(self) -> bool:
@@ -93,6 +84,14 @@ class CaseResult:
     def to_dict(self) -> dict[str, Any]:
         """JSON values; figures that are not finite become text."""
         return {**vars(self), "holds": self.holds, "findings": [*map(_json, self.findings)]}
+
+
+class SelftestReport(TypedDict):
+    """The results of many cases, as JSON values."""
+
+    holds: Annotated[bool, "whether everything holds"]
+    cases: Annotated[list[dict[str, Any]], list[CaseResult], "every case that was run"]
+    failures: Annotated[list[str], "one line for each figure that does not hold, and each error"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +128,7 @@ class Summary:
                     worst[finding.name] = result, finding
         return worst
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> SelftestReport:
         """JSON values."""
         return {
             "holds": self.holds,

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -416,13 +416,28 @@ def reasons(simulation: Simulation) -> list[tuple[str, str]]:
     return lines
 
 
-def counts(simulation: Simulation) -> dict[str, Any]:
-    """Counters of a simulation as JSON values; each kind of effect is there, 0 if not named.
+class EffectCounts(TypedDict):
+    """Counters of a kind of effect."""
 
-    `made` is the number of terms, and `places` for how many places they were computed.
-    """
+    made: Annotated[int, "terms that were made; 0 where none is named"]
+    places: Annotated[int, "places for which they were computed"]
+
+
+class Counts(TypedDict):
+    """Counters of a simulation."""
+
+    frames: Annotated[int, "frames computed"]
+    vertices: Annotated[int, "vertices of these frames"]
+    places: Annotated[int, "places looked at for them, those beside blocks of vertices included"]
+    parts: Annotated[int, "parts of the time over all frames, in each of which every flow acts"]
+    stretches: Annotated[int, "vertices at which the change to the next was computed"]
+    effects: Annotated[dict[str, EffectCounts], "each kind of effect, used or not"]
+
+
+def counts(simulation: Simulation) -> Counts:
+    """Counters of a simulation as JSON values."""
     counters, terms = simulation.counters, simulation.terms
-    kinds = {kind: {"made": 0, "places": 0} for kind in EFFECTS}
+    kinds: dict[str, EffectCounts] = {kind: {"made": 0, "places": 0} for kind in EFFECTS}
     for number, effect in enumerate(simulation.scene.effects):
         kinds[effect.kind]["made"] += number not in terms.idle
         kinds[effect.kind]["places"] += counters.evaluations[number]

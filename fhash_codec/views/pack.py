@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -288,6 +288,31 @@ ABSENT = ("refuse", "fill")
 """Values of `absent`."""
 
 
+class PackedVariable(TypedDict):
+    """A variable that was packed."""
+
+    shape: Annotated[list[int], "steps and vertices (t, z, y, x)"]
+    tile: Annotated[list[int], "of a chunk of the store"]
+    tiles: Annotated[int, "chunks"]
+    absent: Annotated[int, "chunks that the store lacks, which have its fill value"]
+    bytes: Annotated[int, "all chunks, coded"]
+    raw_bytes: Annotated[int, "the values in their own type"]
+    value_range: Annotated[list[float], "smallest and largest value"]
+    codec: Annotated[dict[str, Any], "`max_error`, `max_error_rel` or `step`, if known"]
+
+
+class PackReport(TypedDict):
+    """A file that was packed of a store."""
+
+    path: Annotated[str, "the file written"]
+    bytes: Annotated[int, "its size"]
+    source_bytes: Annotated[int | None, "bytes of the store on disk"]
+    raw_bytes: Annotated[int, "the values in their own type"]
+    ratio: Annotated[float, "`raw_bytes / bytes`"]
+    seconds: Annotated[float, "of the whole command"]
+    variables: Annotated[dict[str, PackedVariable], "the variables by name"]
+
+
 def pack(
     source: str | Path,
     path: str | Path,
@@ -299,7 +324,7 @@ def pack(
     timings: bool = True,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> PackReport:
     """Make a container of the arrays of a Zarr store that `fhash.transform` coded.
 
     The bytes of the chunks are copied, so that every value has the bits that zarr decodes from the
@@ -316,9 +341,8 @@ def pack(
     timings: keep the date; without it the same store gives the same bytes.
     force: replace a file that exists.
 
-    Returns `path`, `bytes`, `source_bytes`, `raw_bytes`, `ratio`, `seconds`, and in `variables` the
-    figures of each. Raises InputError for arrays that have to be coded again, and for chunks that
-    are missing; DamagedFileError for damaged chunks; OutputExistsError and OutputError.
+    Raises InputError for arrays that have to be coded again, and for chunks that are missing;
+    DamagedFileError for damaged chunks; OutputExistsError and OutputError.
     """
     begun = time.perf_counter()
     source, path = _folder(source), Path(os.path.normpath(path))
@@ -329,7 +353,7 @@ def pack(
     root, names = _all_coded(source) if variables is None else (source, list(variables))
     request = Request(axes=None if axes is None else tuple(axes), select=selection(select))
     job = _Job(source=root, request=request, absent=absent, timings=timings, progress=progress)
-    figures: dict[str, Any] = {}
+    figures: dict[str, PackedVariable] = {}
     several = names if len(names) > 1 else ()
     with ContainerWriter(path, force=force, variables=several) as writer:
         if len(names) == 1:
@@ -351,7 +375,7 @@ def pack(
 
 
 def _write_several(
-    writer: ContainerWriter, job: _Job, names: Sequence[str], figures: dict[str, Any]
+    writer: ContainerWriter, job: _Job, names: Sequence[str], figures: dict[str, PackedVariable]
 ) -> int:
     """Write several variables, and add the figures of each; the bytes of the file."""
     for name in names:
@@ -386,7 +410,7 @@ class _Job:
 
     def write(
         self, writer: ContainerWriter, series: FileSeries, array: CodedArray, note: str
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    ) -> tuple[dict[str, Any], PackedVariable]:
         """Write the arrays of a variable; its header and its figures."""
         nothing = Scan(value_range=ValueRange(0.0, 0.0), mean=0.0, finite_count=0, missing={})
         described = write_series(

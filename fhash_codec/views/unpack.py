@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -187,6 +187,21 @@ def _refusal(volume: Volume, what: str) -> str:
     )
 
 
+class UnpackedVariable(TypedDict):
+    """A variable that was unpacked."""
+
+    tiles: Annotated[int, "chunks"]
+
+
+class UnpackReport(TypedDict):
+    """A store that was unpacked of a file."""
+
+    path: Annotated[str, "the store written"]
+    bytes: Annotated[int, "all its files"]
+    seconds: Annotated[float, "of the whole command"]
+    variables: Annotated[dict[str, UnpackedVariable], "the variables by name"]
+
+
 def unpack(
     path: str | Path,
     output: str | Path,
@@ -194,7 +209,7 @@ def unpack(
     variables: Sequence[str] | None = None,
     force: bool = False,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> UnpackReport:
     """Make a Zarr store (format 3, a folder) of the tiles of a container.
 
     The bytes of the tiles are copied. zarr, xarray and dask decode them where fhash is installed,
@@ -202,9 +217,8 @@ def unpack(
 
     variables: names of those to take; all by default. force: replace a store that exists.
 
-    Returns `path`, `bytes`, `seconds`, and in `variables` the number of tiles of each. Raises
-    InputError for a file whose tiles alone are not its values, with the command that writes such a
-    store; DamagedFileError, OutputExistsError and OutputError.
+    Raises InputError for a file whose tiles alone are not its values, with the command that writes
+    such a store; DamagedFileError, OutputExistsError and OutputError.
     """
     begun, output = time.perf_counter(), Path(os.path.normpath(output))
     check_output(output, force, directory=True, sources=[str(path)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 
@@ -38,13 +38,13 @@ class OutputError(FhashError, OSError):
 
 
 class QualityError(FhashError):
-    """A promised quality that was missed; `figures` holds the quality reached, as JSON values."""
+    """A promised quality that was missed; `figures` is the report of the file."""
 
     exit_code = 3
 
-    def __init__(self, message: str, figures: dict[str, Any] | None = None) -> None:
+    def __init__(self, message: str, figures: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
-        self.figures = figures or {}
+        self.figures: Any = figures or {}
 
 
 class DamagedFileError(FhashError, ValueError):

@@ -11,7 +11,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Annotated, Any, NotRequired, Self, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -307,6 +307,14 @@ def index_coordinate(axis: str, length: int) -> Coordinate:
     return Coordinate(name=AXIS_NAMES[axis], values=np.arange(length, dtype=np.float64))
 
 
+class NotStoredValues(TypedDict):
+    """Values that nobody wrote, as JSON values."""
+
+    share: Annotated[float, "of all values, 0 to 1"]
+    steps: Annotated[list[list[int]], "runs of steps that have such values, [first, end)"]
+    fill: NotRequired[Annotated[float, "what stands there; left out where it is not finite"]]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NotStored:
     """Values of a series that nobody wrote: one number stands in their place.
@@ -334,10 +342,12 @@ class NotStored:
             spans[MAX_SPANS - 1 :] = [[spans[MAX_SPANS - 1][0], spans[-1][1]]]
         return spans
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> NotStoredValues:
         """JSON values, as the header of a container has them."""
-        found: dict[str, Any] = {"share": round(self.share, 6), "steps": self.spans()}
-        return found | ({"fill": self.fill} if math.isfinite(self.fill) else {})
+        found: NotStoredValues = {"share": round(self.share, 6), "steps": self.spans()}
+        if math.isfinite(self.fill):
+            found["fill"] = self.fill
+        return found
 
     def of_steps(self, steps: Sequence[int]) -> NotStored | None:
         """The same of some steps; None where everything of these was stored."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from folders import listing
+from json_schemas import hold
 
 SHAPE = (3, 6, 7, 8)
 SMALL = ["--effort", "1", "--quiet"]
@@ -22,7 +23,10 @@ Refused = Callable[..., str]
 def invoke(*words: object) -> Result:
     from fhash_cli.main import program
 
-    return CliRunner().invoke(program, [str(word) for word in words], prog_name="fhash")
+    texts = [str(word) for word in words]
+    result = CliRunner().invoke(program, texts, prog_name="fhash")
+    hold(texts, result)
+    return result
 
 
 def tiny_values() -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import click
 
@@ -17,7 +17,7 @@ from fhash_cli.output import Progress, emit, extent, table
 if TYPE_CHECKING:
     from fhash_bench.paper.bench import BenchPlan, PaperBench
     from fhash_bench.paper.files import FileResult
-    from fhash_bench.paper.printed import PaperTable
+    from fhash_bench.paper.printed import PaperTable, TableReport
     from fhash_formats.series import Series
 
 
@@ -167,8 +167,13 @@ def paper(
         tables = tables_of(result.cells, encoded, refused)
         written, missing = write_report(result.cells, tables, Path(folder))
     result = replace(result, notes=(*result.notes, *missing))
-    found = {"tables": [entry.to_dict() for entry in tables], "files": [str(f) for f in written]}
-    emit(result.to_dict() | found, _text(result, tables, written), as_json)
+    report: PaperReport = {
+        "cells": [cell.to_dict() for cell in result.cells],
+        "tables": [entry.to_dict() for entry in tables],
+        "notes": list(result.notes),
+        "files": [str(path) for path in written],
+    }
+    emit(report, _text(result, tables, written), as_json)
 
 
 def _files(
@@ -205,7 +210,22 @@ def _plan(scenes: bool, *, quick: bool, **choices: Any) -> BenchPlan:
     return BenchPlan.quick(**given) if quick else BenchPlan(**given)
 
 
-def _parameters() -> tuple[dict[str, Any], str]:
+class Parameters(TypedDict):
+    """Sizes of the models at the paper's configurations."""
+
+    parameters: Annotated[dict[str, dict[str, int]], "numbers by data set and encoding"]
+
+
+class PaperReport(TypedDict):
+    """The paper's tables, quoted figures beside ours."""
+
+    cells: Annotated[list[dict[str, Any]], "each training, as in its file"]
+    tables: Annotated[list[TableReport], "the tables, and the paper's claims"]
+    notes: Annotated[list[str], "what was not measured, and why"]
+    files: Annotated[list[str], "tables and curves that were written"]
+
+
+def _parameters() -> tuple[Parameters, str]:
     """Numbers of parameters at the paper's configurations, and their table."""
     from fhash_bench.paper.data import ENCODINGS, SETS, paper_parameters
 

@@ -26,6 +26,7 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 
 if TYPE_CHECKING:
     from fhash_bench.ablate import AblateBench, Row
+    from fhash_bench.train import PointRate, TrainBench
     from fhash_codec.config import EncodeConfig
 
 
@@ -147,7 +148,7 @@ def train(
     emit(result, _train_text(result), as_json)
 
 
-def _train_text(result: dict[str, Any]) -> str:
+def _train_text(result: TrainBench) -> str:
     """A table for each entry, its facts and points, what the machine can do, and the machine."""
     lines = []
     for entry in result["series"]:
@@ -211,7 +212,7 @@ def _threads(runs: list[dict[str, Any]]) -> list[str]:
     return [f"{count} threads over one, time that passed: {', '.join(ratios)}"] if ratios else []
 
 
-def _points(points: list[dict[str, Any]]) -> str:
+def _points(points: list[PointRate]) -> str:
     """The rates of queries at points in one thread."""
     rates = [
         f"{point['order']}{' with gradient' * point['gradient']}"

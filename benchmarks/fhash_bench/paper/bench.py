@@ -165,10 +165,6 @@ class PaperBench:
     cells: tuple[Cell, ...]
     notes: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values by field name."""
-        return {"cells": [cell.to_dict() for cell in self.cells], "notes": list(self.notes)}
-
 
 def bench_paper(
     plan: BenchPlan,

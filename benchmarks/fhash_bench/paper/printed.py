@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 NOT_REACHED_TEXT = "NR"
 """Text of a quality that was not reached."""
@@ -64,6 +64,18 @@ Value = Spread | float | int | str | None
 """A cell of a table; None where nothing was measured."""
 
 
+class TableReport(TypedDict):
+    """A table of results beside the paper's, as JSON values."""
+
+    name: Annotated[str, "such as `table-3-equal`"]
+    title: Annotated[str, "one line"]
+    rows: Annotated[
+        list[dict[str, Any]],
+        'by heading; `{median, low, high, seeds}` over seeds; `"NR"` where not reached',
+    ]
+    notes: Annotated[list[str], "what to know about the table"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class PaperTable:
     """A table of results beside the paper's.
@@ -94,7 +106,7 @@ class PaperTable:
         lines += ["", *(f"- {note}" for note in self.notes)] if self.notes else []
         return "\n".join(lines) + "\n"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> TableReport:
         """JSON values: each row by its headings."""
         return {
             "name": self.name,

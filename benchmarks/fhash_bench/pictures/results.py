@@ -33,6 +33,7 @@ class Switch:
     """An effect or an acceleration on and off, all else alike.
 
     Attributes:
+        name: its name. off_ms, on_ms: milliseconds of a picture.
         counters_off, counters_on: counters of the last picture.
         psnr: dB between the two pictures; None where they are equal or meant to differ.
     """
@@ -55,6 +56,7 @@ class Stream:
     """One march.
 
     Attributes:
+        mode: way to march. milliseconds: of a picture. passes, samples, evaluations: its counters.
         budget: N_r, None for the number of rays.
         psnr: dB to the picture of the cached march, None where nothing differs.
         largest: largest difference to that picture, 0..1.
@@ -111,6 +113,7 @@ class Against:
     Both have the same decoded frame, transfer function, camera, step and number of threads.
 
     Attributes:
+        scene: its name. shaded: whether it is lit. size: pixels along both sides.
         ours_ms: time of marching.
         whole_ms: time of `Renderer.render`, planning included.
         vtk_ms: time of VTK's `Render` less `window_ms`.
@@ -142,6 +145,7 @@ class Beside:
 
     Attributes:
         peer: name and version.
+        scene: its name. shaded: whether it is lit. size: pixels along both sides.
         threads: of both.
         ours_ms: time of marching.
         peer_ms: time of the peer, less that of its empty window where it has one.
@@ -168,6 +172,7 @@ class Exactness:
     """A picture drawn here and by VTK's mapper for graphics cards.
 
     Attributes:
+        scene: its name. size: pixels along both sides.
         gradient: what the picture here is lit by, `cell` or `central` (as VTK); empty where it is
             unlit.
         step: ray step in vertex spacings.
@@ -190,7 +195,11 @@ class Exactness:
 class Playback:
     """Steps drawn one after the other, each for the first time.
 
-    The time here includes decoding. VTK's frames are decoded; its time includes loading them.
+    Attributes:
+        scene: its name. shaded: whether it is lit. size: pixels along both sides.
+        steps: their number.
+        ours_ms: milliseconds of a step, decoding included.
+        vtk_ms: those of VTK, whose frames are decoded; loading them included.
     """
 
     scene: str
@@ -211,6 +220,7 @@ class Quality:
     """One setting of a knob.
 
     Attributes:
+        knob, value: what is set. milliseconds: of a picture. samples: its counter.
         psnr: dB to the picture of the finest setting, None where they are equal.
     """
 
@@ -226,8 +236,10 @@ class RenderBench:
     """Everything that `bench_render` measured.
 
     Attributes:
-        turns: runs of each median.
+        series: source and variable. shape: (t, z, y, x). step: step drawn.
+        size: pixels along both sides. turns: runs of each median.
         refused: for each part that could not be measured, the reason.
+        machine: date, command line, processor, load, versions. notes: how it was measured.
     """
 
     series: str

@@ -11,7 +11,7 @@ from functools import partial
 from math import prod
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -76,6 +76,7 @@ class Speed:
     """Speed of a codec at a quality in 10^6 bytes of raw data a second, the best of some runs.
 
     Attributes:
+        codec, setting: as of `Point`. psnr: dB.
         encode_mb_s, decode_mb_s: by the clock on the wall.
         encode_core_mb_s, decode_core_mb_s: by the time of all cores, so those of one.
         encode_runs: runs of encoding.
@@ -96,6 +97,7 @@ class Access:
     """Access to a small region of one step: medians over random places.
 
     Attributes:
+        codec, setting: as of `Point`.
         region: lengths (z, y, x).
         bytes: size of all the data in this layout.
         psnr: dB of all the data.
@@ -134,11 +136,23 @@ class TilePrice:
     steps: int
 
 
+class BestPeer(TypedDict):
+    """The best peer at a quality."""
+
+    goal: Annotated[str, "`psnr` or `bound`"]
+    asked: Annotated[float, "dB, or share of the range"]
+    peer: Annotated[str | None, "its name; null where none reached it"]
+    bytes: Annotated[int | None, "that it took"]
+    ratios: Annotated[dict[str, float | None], "its bytes over those of each profile of fhash"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class RateBench:
     """Everything that `bench_rate` measured.
 
     Attributes:
+        series: source and variable. shape: (t, z, y, x). dtype: number type.
+        raw_bytes: size of the array. value_range: smallest and largest value.
         tiles: price of the tiles of the profile compact at each quality.
         missing: number of values that are not finite. Lossy peers were given neighbouring values in
             their place.
@@ -160,13 +174,9 @@ class RateBench:
     machine: dict[str, Any]
     notes: tuple[str, ...]
 
-    def best_peers(self) -> list[dict[str, Any]]:
-        """The best peer at each quality, beside fhash.
-
-        A row is {goal, asked, peer, bytes, ratios}; ratios: for each profile of fhash the bytes of
-        the best peer over its own, or None.
-        """
-        rows = []
+    def best_peers(self) -> list[BestPeer]:
+        """The best peer at each quality, beside fhash."""
+        rows: list[BestPeer] = []
         for goal, asked in dict.fromkeys((point.goal, point.asked) for point in self.points):
             here = [point for point in self.points if (point.goal, point.asked) == (goal, asked)]
             own = [point for point in here if point.codec.startswith(OWN)]
@@ -183,8 +193,8 @@ class RateBench:
                 {
                     "goal": goal,
                     "asked": asked,
-                    "peer": best and best.codec,
-                    "bytes": best and best.bytes,
+                    "peer": best.codec if best else None,
+                    "bytes": best.bytes if best else None,
                     "ratios": ratios,
                 }
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import click
 
@@ -31,6 +31,17 @@ from fhash_cli.output import (
 )
 from fhash_formats.errors import QualityError
 
+if TYPE_CHECKING:
+    from fhash_codec.comparison import Compared
+
+
+class Verified(TypedDict):
+    """A file that was read whole."""
+
+    path: Annotated[str, "the file"]
+    sound: Annotated[Literal[True], "a damaged file is an error"]
+    arrays: Annotated[int, "number of arrays that were read and checked"]
+
 
 @click.command("verify", cls=BaseCommand)
 @run_argument
@@ -43,11 +54,8 @@ def verify_command(run: str, variable: str | None, as_json: bool, quiet: bool) -
 
     with fhash_codec.open(run, variable=variable) as volume, Progress(quiet=quiet) as progress:
         arrays = volume.verify(progress=progress)
-    emit(
-        {"path": run, "sound": True, "arrays": arrays},
-        f"{one_line(run)}: sound, {arrays} arrays checked",
-        as_json,
-    )
+    result: Verified = {"path": run, "sound": True, "arrays": arrays}
+    emit(result, f"{one_line(run)}: sound, {arrays} arrays checked", as_json)
 
 
 @click.command("diff", cls=BaseCommand)
@@ -153,7 +161,7 @@ def _missing_of(run: str, variable: str | None) -> float | None:
 
 
 def _missed_gate(
-    run: str, report: dict[str, Any], min_psnr: float | None, max_error: float | None
+    run: str, report: Compared, min_psnr: float | None, max_error: float | None
 ) -> QualityError | None:
     """The error of the first gate that the figures miss; None if they miss none.
 

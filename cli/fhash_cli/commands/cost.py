@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import click
 
@@ -71,8 +71,14 @@ def command(
         stopped = InterruptedEncodingError(
             f"interrupted; {paths[0]} has what was measured until then"
         )
-    result = {"paths": [str(path) for path in paths], **report.to_dict()}
-    emit(result, report_text(report, paths), as_json, stopped)
+    files: ReportFiles = {"paths": [str(path) for path in paths]}
+    emit({**files, **report.to_dict()}, report_text(report, paths), as_json, stopped)
+
+
+class ReportFiles(TypedDict):
+    """Files of a report; `cost.json` of it holds the same object without this key."""
+
+    paths: Annotated[list[str], "page, PNG and JSON"]
 
 
 def check_report_folder(folder: Path, force: bool, data: str) -> None:

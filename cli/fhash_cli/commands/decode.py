@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import click
 
@@ -119,6 +119,32 @@ def _converted(frame: npt.NDArray[Any], kind: np.dtype[Any]) -> npt.NDArray[Any]
     return np.asarray(integers)
 
 
+class DecodedVariable(TypedDict):
+    """A region of a variable."""
+
+    shape: Annotated[Sequence[int], "of the region, (t, z, y, x)"]
+    dtype: Annotated[str, "number type of the values"]
+    steps: Annotated[list[float], "steps, fractional between two of them"]
+    region: Annotated[list[tuple[int, int]], "[first, end) along z, y and x"]
+    min: Annotated[float | None, "smallest value; null without any"]
+    max: Annotated[float | None, "largest value"]
+    mean: Annotated[float | None, "mean value"]
+    inside_fraction: Annotated[float, "share of the region in the coreset"]
+
+
+class Decoded(DecodedVariable):
+    """A region of the one variable."""
+
+    paths: Annotated[list[str], "files written; empty without `-o`"]
+
+
+class DecodedSeveral(TypedDict):
+    """A region of several variables."""
+
+    paths: Annotated[list[str], "files written; empty without `-o`"]
+    variables: Annotated[dict[str, DecodedVariable], "the variables by name"]
+
+
 class Statistics:
     """Smallest, largest and mean value, and share inside the coreset, of frames added one by one.
 
@@ -148,16 +174,6 @@ class Statistics:
         for piece in pieces(frame if integers is None else integers[~np.isnan(frame)]):
             _, low, high = scan_rows(piece[None], self.mean)
             self.low, self.high = min(self.low, low), max(self.high, high)
-
-    def result(self) -> dict[str, float | None]:
-        """JSON values; None where no vertex has a value."""
-        defined = self.mean.count > 0
-        return {
-            "min": self.low if defined else None,
-            "max": self.high if defined else None,
-            "mean": self.mean.value() if defined else None,
-            "inside_fraction": self.inside / self.all,
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -442,22 +458,29 @@ class Part:
         frames = selection.frames(volume, statistics := Statistics(), progress)
         return cls(volume=volume, selection=selection, frames=frames, statistics=statistics)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> DecodedVariable:
         """The keys of `--json`, once all frames were decoded."""
-        chosen = self.selection
+        chosen, found = self.selection, self.statistics
+        defined = found.mean.count > 0
         return {
             "shape": chosen.shape,
             "dtype": chosen.kind.name,
             "steps": chosen.steps,
             "region": [(vertices.start, vertices.stop) for vertices in chosen.vertices],
-            **self.statistics.result(),
+            "min": found.low if defined else None,
+            "max": found.high if defined else None,
+            "mean": found.mean.value() if defined else None,
+            "inside_fraction": found.inside / found.all,
         }
 
 
-def _result(paths: list[str], parts: Sequence[Part]) -> dict[str, Any]:
+def _result(paths: list[str], parts: Sequence[Part]) -> Decoded | DecodedSeveral:
     if len(parts) == 1:
         return {"paths": paths, **parts[0].result()}
-    return {"paths": paths, "variables": {part.volume.variable: part.result() for part in parts}}
+    return {
+        "paths": paths,
+        "variables": {str(part.volume.variable): part.result() for part in parts},
+    }
 
 
 def _say_why_floats(part: Part) -> None:

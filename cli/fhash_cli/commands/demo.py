@@ -6,10 +6,10 @@ import contextlib
 import io
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import click
 
@@ -44,8 +44,9 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from fhash_codec import Volume
+    from fhash_codec.comparison import Compared
     from fhash_codec.progress import Progress as Callback
-    from fhash_codec.simulation.simulate import Simulation
+    from fhash_codec.simulation.simulate import Counts, Simulation
     from fhash_formats.series import Series
 
 OVERHEAD_BYTES = 2**20
@@ -196,13 +197,47 @@ def _sources(chosen: SceneOptions) -> list[str]:
     return [chosen.scene] if Path(chosen.scene).suffix.lower() in SUFFIXES else []
 
 
+class Simulated(TypedDict):
+    """A simulation."""
+
+    scene: Annotated[str, "name of the preset, or of the scene's file without its suffix"]
+    seed: Annotated[int, "seed of the random numbers"]
+    shape: Annotated[list[int], "of the series, (t, z, y, x)"]
+    simulate_seconds: Annotated[float, "of the simulation, writing included"]
+    counters: Annotated[Counts, "what the simulation took"]
+    explain: NotRequired[Annotated[list[list[str]], "`--explain`: topic and reason"]]
+
+
+class SimulatedFile(Simulated):
+    """A simulation that was written to a file."""
+
+    paths: Annotated[list[str], "the files written"]
+
+
+class Demonstrated(Simulated):
+    """A simulation that was encoded and compared."""
+
+    seconds: Annotated[float, "of the encoding"]
+    diff_seconds: Annotated[float, "of the comparison"]
+    data: Annotated[str, "the simulated series"]
+    picture: Annotated[str, "the comparison"]
+    settings: Annotated[str, "options of the encoding"]
+
+
+class Gallery(TypedDict):
+    """A gallery that was made."""
+
+    page: Annotated[str, "the page"]
+    pictures: Annotated[list[str], "the pictures"]
+
+
 def result_of(
     chosen: SceneOptions, simulation: Simulation, seconds: float, explain: bool
-) -> dict[str, Any]:
+) -> Simulated:
     """A simulation as JSON values: what was computed, and with `explain` why."""
     from fhash_codec.simulation.simulate import counts, reasons
 
-    result: dict[str, Any] = {
+    result: Simulated = {
         "scene": chosen.name,
         "seed": simulation.seed,
         "shape": list(simulation.shape),
@@ -225,8 +260,8 @@ def simulation_rows(simulation: Simulation, seconds: float, explain: bool) -> li
         return rows
     rows += [(f"  {topic}", text) for topic, text in reasons(simulation)]
     counted = counts(simulation)
-    effects = counted.pop("effects")
-    rows += [(f"  {name}", f"{value:,}") for name, value in counted.items()]
+    effects = counted["effects"]
+    rows += [(f"  {name}", f"{n:,}") for name, n in counted.items() if isinstance(n, int)]
     zero = [kind for kind, values in effects.items() if not values["places"]]
     rows += [
         (f"  {kind}", f"{values['places']:,} places")
@@ -312,13 +347,13 @@ def _simulate_only(
     explain: bool,
     force: bool,
     progress: Progress,
-) -> tuple[dict[str, Any], Rows]:
+) -> tuple[Mapping[str, object], Rows]:
     """Write the series to a file; the result as JSON values, and as rows."""
     check_writable(path, force, region=True)
     if not progress.quiet:
         say(describe(chosen, simulation))
     paths, seconds = write_series(path, chosen, simulation, force=force, progress=progress)
-    result = {"paths": paths, **result_of(chosen, simulation, seconds, explain)}
+    result: SimulatedFile = {"paths": paths, **result_of(chosen, simulation, seconds, explain)}
     rows = [
         *(("written", written) for written in paths),
         ("t, z, y, x", f"{extent(simulation.shape)}, {simulation.dtype}"),
@@ -334,7 +369,7 @@ def _demonstrate(
     explain: bool,
     force: bool,
     progress: Progress,
-) -> tuple[dict[str, Any], Rows]:
+) -> tuple[Mapping[str, object], Rows]:
     """Simulate, encode, compare and draw; the result as JSON values, and as rows."""
     import fhash_codec
     from fhash_codec.config import EncodeConfig
@@ -364,20 +399,19 @@ def _demonstrate(
         replacing(picture, force=force) as temporary,
     ):
         _draw(chosen.name, series, volume, report).save(temporary, format="PNG", optimize=True)
-    result = {
-        **report,
+    made: Demonstrated = {
         "seconds": encoded["seconds"],
         "diff_seconds": seconds,
         "data": str(data),
-        "path": str(run),
         "picture": str(picture),
         "settings": f"--feature {config.features[0]}",
         **result_of(chosen, simulation, simulating, explain),
     }
+    result = {**report, **made}
     return result, [*_rows(result, series), *simulation_rows(simulation, simulating, explain)]
 
 
-def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) -> Image.Image:
+def _draw(scene: str, series: Series, volume: Volume, report: Compared) -> Image.Image:
     """Draw the slice of constant z with the most of the coreset, at evenly spread steps."""
     from fhash_codec.gallery import Pair, compare
 
@@ -410,7 +444,7 @@ def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) ->
     )
 
 
-def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
+def _rows(result: Mapping[str, Any], series: Series) -> list[tuple[str, str]]:
     return [
         ("data", f"{result['data']}, {extent(series.shape)} {series.dtype}"),
         ("container", f"{result['path']}, by fhash encode {result['settings']}"),
@@ -425,7 +459,7 @@ def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
 
 def make_gallery(
     folder: Path, run: dict[str, click.Command], *, force: bool, quiet: bool
-) -> dict[str, Any]:
+) -> Gallery:
     """Simulate the series, encode and draw them: FOLDER/*.png, FOLDER/series and FOLDER.md.
 
     run: the commands `encode` and `render` by name. Returns the written files as JSON values.

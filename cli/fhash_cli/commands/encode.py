@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import click
 from click.core import ParameterSource
@@ -49,9 +49,11 @@ from fhash_cli.variables import config_of, configs_of, report_table, variables_t
 from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
+    from fhash_codec.comparison import EncodeReport
     from fhash_codec.config import EncodeConfig
-    from fhash_codec.cost.encodings import ModelChoice
-    from fhash_codec.cost.prediction import Choice
+    from fhash_codec.cost.encodings import ModelChoice, ModelsCompared
+    from fhash_codec.cost.prediction import Choice, TimeBudget
+    from fhash_codec.encoding import DatasetReport
     from fhash_formats.series import Series
 
 MAX_LABELS = 64
@@ -71,6 +73,13 @@ class EncodeOptions:
     report_folder: str | None
     as_json: bool
     quiet: bool
+
+
+class Chosen(TypedDict, total=False):
+    """Choices made for the user, beside the figures of the file."""
+
+    models: Annotated[ModelsCompared, "`--profile auto`: the choice between both models"]
+    time_budget: Annotated[TimeBudget, "`--time-budget`: the choice of effort or epochs"]
 
 
 @click.command("encode", cls=BaseCommand)
@@ -184,17 +193,18 @@ def command(
     if report_folder is not None:
         rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows) + _explained(report, explain)
+    chosen: Chosen = {}
     if model is not None:
-        report["models"] = model.to_dict()
+        chosen["models"] = model.to_dict()
         text += f"\n\n{model_table(model)}" if model.prices else ""
     if choice is not None:
-        report["time_budget"] = choice.to_dict()
-    return emit(report, text, as_json, missed or stopped)
+        chosen["time_budget"] = choice.to_dict()
+    return emit({**report, **chosen}, text, as_json, missed or stopped)
 
 
-def _explained(figures: dict[str, Any], explain: bool, title: str = "") -> str:
+def _explained(figures: EncodeReport, explain: bool, title: str = "") -> str:
     """The table of the stages of a report, which keeps them only where they are asked for."""
-    stages = figures.pop("stages")
+    stages = figures.pop("stages", [])
     if not explain:
         return ""
     figures["stages"] = stages
@@ -230,7 +240,7 @@ def _encode_several(
     settings: Mapping[str, Any],
     force: bool,
     quiet: bool,
-) -> tuple[dict[str, Any], QualityError | None]:
+) -> tuple[DatasetReport, QualityError | None]:
     """Encode several variables into one file: its figures, and the promises that it misses.
 
     several: how each is opened, by its name.
@@ -257,7 +267,7 @@ def _encode_several(
 
 
 def _emit_several(
-    encoded: tuple[dict[str, Any], QualityError | None], explain: bool, as_json: bool
+    encoded: tuple[DatasetReport, QualityError | None], explain: bool, as_json: bool
 ) -> None:
     """Print the figures of a file of several variables, and raise what it misses."""
     report, missed = encoded
@@ -375,7 +385,7 @@ def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
 
 def _write_report(
     series: Series,
-    figures: dict[str, Any],
+    figures: EncodeReport,
     config: EncodeConfig,
     folder: Path,
     force: bool,
@@ -419,7 +429,7 @@ def _after_interruption(output: str, before: tuple[int, int] | None) -> str:
 
 
 def report_rows(
-    report: dict[str, Any], units: str, *, part: bool, verbose: bool
+    report: EncodeReport, units: str, *, part: bool, verbose: bool
 ) -> list[tuple[str, str]]:
     """An encoding's report as a table.
 

@@ -33,6 +33,13 @@ from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec import Dataset, Volume
+    from fhash_codec.file_info import (
+        CoordinateDetails,
+        DataInfo,
+        DatasetInfo,
+        SeriesDetails,
+        VolumeInfo,
+    )
     from fhash_formats.readers.listing import Listed
     from fhash_formats.series import Coordinate, Series
 
@@ -225,12 +232,12 @@ def _dimension(name: str, length: int, axis: str) -> str:
     return f"{name}={length}{note}"
 
 
-def details(series: Series) -> dict[str, Any]:
-    """An open series as JSON values: shape, type, units, coordinates and attributes."""
+def details(series: Series) -> SeriesDetails:
+    """An open series as JSON values."""
     from fhash_codec.times import is_dated, time_text
     from fhash_formats.support.values import json_attributes
 
-    coordinates = []
+    coordinates: list[CoordinateDetails] = []
     for axis in "tzyx":
         coordinate = series.coords[axis]
         ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
@@ -317,7 +324,7 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
         found = source.list(path)
         files = len(files_of(path)) if is_pattern(path) else 1
         variables = [variable.as_dict(path) for variable in found]
-        result = {"path": path, "files": files, "variables": variables}
+        result: DataInfo = {"path": path, "files": files, "variables": variables}
         text = listing(path, files, found, named=source.var is not None)
         readings = [(entry.name, words) for entry in found for words in entry.options]
         if len(readings) == 1 and (source.var is not None or source.t is not None):
@@ -336,7 +343,7 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
         if isinstance(opened, fhash_codec.Dataset):
             _emit_dataset(opened, as_json)
             return
-        info = {**opened.info, "config": opened.config, "card": opened.describe()}
+        info: VolumeInfo = {**opened.info, "card": opened.describe()}
         rows = [*_rows(opened, info), *card_rows(info, verbose=verbose)]
         emit(info, table(rows), as_json)
 
@@ -346,7 +353,7 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
     infos = {name: volume.info for name, volume in dataset.items()}
     version, container = dataset.container.header["format_version"], dataset.container
     raw = sum(info["raw_bytes"] for info in infos.values())
-    result = {
+    result: DatasetInfo = {
         "path": str(dataset.path),
         "format_version": version,
         "bytes": container.size,
@@ -386,7 +393,7 @@ def _is_run(path: str) -> bool:
     return False
 
 
-def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
+def _rows(volume: Volume, info: VolumeInfo) -> list[tuple[str, str]]:
     from fhash_codec.config import MODELS
 
     dtype = info["variable"]["dtype"]
@@ -448,7 +455,7 @@ def _missing(volume: Volume) -> str:
     return "" if fill is None else f", missing where the source had {fill:.9g}"
 
 
-def _training(info: dict[str, Any]) -> str:
+def _training(info: VolumeInfo) -> str:
     """The training of the model: steps, time, device; files before version 1.3 tell less."""
     training, model = info["training"], info["model"]
     told = "steps" in training
@@ -470,7 +477,7 @@ def _training(info: dict[str, Any]) -> str:
     )
 
 
-def _predicted(info: dict[str, Any]) -> list[tuple[str, str]]:
+def _predicted(info: VolumeInfo) -> list[tuple[str, str]]:
     """The row of what was predicted before the encoding, and what it took; none without either."""
     encoder = info["encoder"]
     told = encoder.get("predicted")
@@ -490,7 +497,7 @@ def _predicted(info: dict[str, Any]) -> list[tuple[str, str]]:
     return [("predicted", f"{', '.join(parts)}{was}, {size(info['bytes'])}")]
 
 
-def tiling_text(info: dict[str, Any]) -> str:
+def tiling_text(info: VolumeInfo) -> str:
     """The price of the tiles and the time for a region, as far as the header says them."""
     told = info["model"].get("tiling", {})
     text = ""
@@ -508,7 +515,7 @@ def tiling_text(info: dict[str, Any]) -> str:
     return text
 
 
-def _compact(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
+def _compact(volume: Volume, info: VolumeInfo) -> list[tuple[str, str]]:
     encoder = info["encoder"] if "steps" in info["training"] else info["training"]
     seconds = encoder.get("seconds")
     took = "" if seconds is None else f", encoded in {number(seconds, 's', digits=3)}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypedDict
 
 import click
 from click.core import ParameterSource
@@ -22,6 +22,7 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 from fhash_cli.variables import config_of
 
 if TYPE_CHECKING:
+    from fhash_codec.comparison import EncodeReport
     from fhash_codec.config import EncodeConfig
     from fhash_formats.series import Series
 
@@ -30,6 +31,17 @@ PLANNED = (
     "seed",
 )  # fmt: skip
 """Settings of a plan: of the profile compact, and a bound as the promise."""
+
+
+class PlanReport(TypedDict):
+    """A plan that was written."""
+
+    path: Annotated[str, "the file written"]
+    bytes: Annotated[int, "its size"]
+    shape: Annotated[list[int], "vertices of the series along t, z, y and x"]
+    tile: Annotated[list[int], "those of a tile"]
+    layers: Annotated[int, "layers of tiles along time, and so the most parts that there can be"]
+    value_range: Annotated[list[float], "the least and the greatest value"]
 
 
 @click.command("plan", cls=BaseCommand)
@@ -65,7 +77,7 @@ def plan_command(
         plan = plan_parts(series, output, config_of(settings), force=force, progress=progress)
         units = series.units
     low, high = plan.value_range.low, plan.value_range.high
-    report: dict[str, Any] = {
+    report: PlanReport = {
         "path": output,
         "bytes": len(plan.to_bytes()),
         "shape": list(plan.shape),
@@ -142,8 +154,8 @@ def encode_all_or_part(
     force: bool,
     progress: Progress,
     predicted: dict[str, Any] | None,
-) -> dict[str, Any]:
-    """Encode a series, or one part of it; the report, with its stages."""
+) -> EncodeReport:
+    """Encode a series, or one part of it."""
     import fhash_codec
     from fhash_codec.appending.parts import Part, encode_part
     from fhash_codec.appending.series_plan import SeriesPlan

@@ -6,10 +6,10 @@ import dataclasses
 import functools
 import json
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NotRequired, TypedDict
 
 import click
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.image import Image
     from fhash_codec.rendering.plan import Plan
     from fhash_codec.rendering.scenes import Scene
-    from fhash_codec.rendering.tracking import Tracked
+    from fhash_codec.rendering.tracking import Followed, Tracked
 
 NUMBERS = {2: "A,B", 3: "X,Y,Z"}
 """Placeholders of options that take so many numbers."""
@@ -571,6 +571,17 @@ def _check_pictures(volume: Volume, output: str, pictures: str | None, force: bo
             check_writable(first, force or counted, sources=[volume.path])
 
 
+class Evolved(TypedDict):
+    """Several steps in one picture."""
+
+    paths: Annotated[list[str], "files written"]
+    steps: Annotated[list[float], "steps of the panels"]
+    size: Annotated[list[int], "width and height"]
+    counters: Annotated[dict[str, int], "rays, passes, samples, evaluations, gradients, and more"]
+    seconds: Annotated[float, "of drawing"]
+    tracked: Annotated[list[Followed], "`--track`: the features that were followed"]
+
+
 def _draw_evolution(
     volume: Volume,
     scene: Scene,
@@ -579,7 +590,7 @@ def _draw_evolution(
     *,
     force: bool,
     progress: Progress,
-) -> tuple[dict[str, Any], str]:
+) -> tuple[Evolved, str]:
     """Draw an evolution as one picture, and follow the features of `--track`."""
     from fhash_codec.rendering import render
     from fhash_codec.rendering.image import check_picture_name
@@ -594,7 +605,7 @@ def _draw_evolution(
     image = render(volume, shown, progress=progress)
     paths = [str(path) for path in image.save(output, force=force)]
     followed = follow(volume, tracked, steps) if tracked else []
-    result = {
+    result: Evolved = {
         "paths": paths,
         "steps": steps,
         "size": list(image.rgba.shape[1::-1]),
@@ -610,7 +621,7 @@ def _draw_evolution(
     return result, table(rows) + ("\n\n" + _followed(followed) if followed else "")
 
 
-def _followed(followed: list[dict[str, Any]]) -> str:
+def _followed(followed: Sequence[Followed]) -> str:
     """Size and centroid of each feature at each step."""
     header = ("step", *(entry["feature"] for entry in followed))
     rows = []
@@ -632,6 +643,20 @@ class PictureOptions:
     save_scene: str | None
     explain: bool
     force: bool
+
+
+class Rendered(TypedDict):
+    """One picture."""
+
+    paths: Annotated[list[str], "files written"]
+    size: Annotated[list[int], "width and height"]
+    step: Annotated[float, "step that it shows"]
+    time: Annotated[float, "its physical time"]
+    march: Annotated[str, "way to march"]
+    lod: Annotated[int, "level of detail"]
+    counters: Annotated[dict[str, int], "rays, passes, samples, evaluations, gradients, and more"]
+    seconds: Annotated[float, "of drawing"]
+    plan: NotRequired[Annotated[dict[str, str], "`--explain`: what was decided, and why"]]
 
 
 @click.command("render", cls=BaseCommand)
@@ -688,10 +713,10 @@ def command(
                     " leave them out of an animation or evolution"
                 )
             draw = _draw_evolution if several.animate is None else _animate
-            result, text = draw(
+            drawn, text = draw(
                 volume, scene, several, str(path), force=picture.force, progress=progress
             )
-            emit(result, text, as_json)
+            emit(drawn, text, as_json)
             return
         scene = tracking(volume, scene, several, progress)
         _check_outputs(path, picture, scene, run)
@@ -701,7 +726,7 @@ def command(
         times = volume.coords["t"]
         time = "" if is_static(times) else f"{plan.step:g}, t = {time_text(times, plan.time)}"
     paths = [str(written) for written in _save(image, path, picture)]
-    result = {
+    result: Rendered = {
         "paths": paths,
         "size": list(scene.size),
         "step": plan.step,

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import webbrowser
 from pathlib import Path
+from typing import Annotated, TypedDict
 from xml.sax.saxutils import quoteattr
 
 import click
@@ -20,6 +21,21 @@ from fhash_formats.native import FOLDER
 
 PORT = 8643
 """Port unless another is asked for."""
+
+
+class Shown(TypedDict):
+    """Containers that a server shows; printed once, when it listens."""
+
+    url: Annotated[str, "where the page is, with a slash at the end"]
+    files: Annotated[list[str], "names of the containers"]
+
+
+class Written(TypedDict):
+    """The page and containers, written for another server."""
+
+    folder: Annotated[str, "the folder written"]
+    files: Annotated[list[str], "paths of all files written"]
+    bytes: Annotated[int, "size of these files"]
 
 
 @click.command("view", cls=BaseCommand)
@@ -65,12 +81,14 @@ def view_command(
             ("written", f"{one_line(folder)}: {len(outputs)} files, {size(written)}"),
             ("to look at it", f"python -m http.server -d {one_line(folder)} serves it here"),
         ]
-        report = {"folder": folder, "files": [str(output) for output in outputs], "bytes": written}
+        files = [str(output) for output in outputs]
+        report: Written = {"folder": folder, "files": files, "bytes": written}
         emit(report, table(rows), as_json)
         return
     with Server(page, port=port, news=say) as server:
+        shown: Shown = {"url": server.url, "files": list(page.runs)}
         emit(
-            {"url": server.url, "files": list(page.runs)},
+            shown,
             f"{one_line(', '.join(page.runs))} at {server.url}\nCtrl-C ends it.",
             as_json,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from typing import Annotated, TypedDict
 
 import click
 
@@ -174,6 +175,14 @@ PORT = 8642
 """Port unless another is asked for."""
 
 
+class Served(TypedDict):
+    """A file that is served; printed once, when the server listens."""
+
+    path: Annotated[str, "the file served"]
+    url: Annotated[str, "where, with a slash at the end and the port that `--port 0` found"]
+    arrays: Annotated[list[str], "names of the arrays of values, one for each variable"]
+
+
 @click.command("serve", cls=BaseCommand)
 @run_argument
 @click.option(
@@ -213,8 +222,9 @@ def serve_command(run: str, port: int, host: str, origins: tuple[str, ...], as_j
     volume, view = opened_view(run)
     with volume, Server(view, host=host, port=port, origins=origins, news=say) as server:
         arrays = list(view.names.values())
+        served: Served = {"path": run, "url": server.url, "arrays": arrays}
         emit(
-            {"path": run, "url": server.url, "arrays": arrays},
+            served,
             f"{one_line(run)}: {one_line(', '.join(arrays))} at {server.url}\n"
             f'  xarray.open_zarr("{server.url}")\nCtrl-C ends it.',
             as_json,

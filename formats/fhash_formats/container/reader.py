@@ -10,7 +10,7 @@ from itertools import chain, pairwise
 from math import prod
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -359,6 +359,16 @@ SPLIT = {
 """First parts of the names of arrays, by what `Container.split` calls their bytes."""
 
 
+class Split(TypedDict):
+    """Bytes of a file by what they hold; they add up to its size."""
+
+    field: Annotated[int, "tables, residual, corrections, and which vertices have values"]
+    coordinates: Annotated[int, "arrays of positions along an axis"]
+    beside: Annotated[int, "arrays that the source has beside the values"]
+    model: Annotated[int, "layers, and documents of coded tables: head, bases and steps"]
+    index: Annotated[int, "header, directory, names, and all else"]
+
+
 def split_bytes(total: int, arrays: Iterable[tuple[str, StoredArray]]) -> dict[str, int]:
     """Bytes by what they hold, as `Container.split` has them, of so many in all."""
     found = dict.fromkeys(SPLIT, 0)
@@ -585,12 +595,7 @@ class Container:
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
 
     def split(self) -> dict[str, int]:
-        """Bytes of the file by what they hold, which add up to `size`.
-
-        Keys: `field` (tables, residual, corrections, and which vertices have values), `coordinates`
-        and `beside` (arrays of either), `model` (layers, and documents of coded tables: they have
-        head, bases and steps) and `index` (header, directory, names, and all else).
-        """
+        """Bytes of the file by what they hold, see `Split`."""
         arrays = {
             array.name: (name, array)
             for each in self.variables.values() or [self]

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, TypedDict
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.cf import Packing
@@ -28,6 +28,28 @@ from fhash_formats.readers.layout import (
 from fhash_formats.readers.variables import Variable, kind_of, named, plain_name
 from fhash_formats.series import AXES, Series, empty_selection
 from fhash_formats.support.values import plain_text
+
+
+class ListedDimension(TypedDict):
+    """A dimension of a variable, as JSON values."""
+
+    name: Annotated[str, "its name, or `dim0` and so on"]
+    length: Annotated[int, "its length"]
+    axis: Annotated[str, "`t`, `z`, `y`, `x`, `select` (one index) or `?` (unclear)"]
+
+
+class ListedVariable(TypedDict):
+    """A variable of a source, as JSON values."""
+
+    name: Annotated[str, "as `--var` takes it"]
+    shape: Annotated[list[int], "lengths in the order of the file"]
+    dtype: Annotated[str, "type of the values"]
+    stored: Annotated[str, "type of packed numbers; empty where nothing is packed"]
+    missing: Annotated[list[float | str], "missing values; text if not finite"]
+    units: Annotated[str, "may be empty"]
+    dimensions: Annotated[list[ListedDimension], "in the order of the file"]
+    commands: Annotated[list[str], "the command that encodes it, one for each likely reading"]
+    problem: Annotated[str, "why it cannot be encoded; empty where it can"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +104,7 @@ class Listed:
             for options in self.options
         ]
 
-    def as_dict(self, path: str) -> dict[str, Any]:
+    def as_dict(self, path: str) -> ListedVariable:
         """JSON values: all attributes, and the commands."""
         return {
             "name": self.name,

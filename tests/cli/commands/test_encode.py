@@ -17,11 +17,6 @@ from fhash_cli.output import Progress
 
 SMALL = ["--effort", "1", "--quiet"]
 PAPER = ["--profile", "paper", "--epochs", "2", "--width", "4", "--quiet"]
-KEYS = {
-    "bytes", "raw_bytes", "ratio", "psnr", "rmse", "max_abs_error", "psnr_domain", "seconds",
-    "epochs", "curve", "shape", "key_frames", "feature_bounding_box", "coreset_fraction",
-    "parameters", "profile", "device",
-}  # fmt: skip
 
 
 def test_what_each_stage_bought_is_in_the_table_and_in_json(
@@ -29,7 +24,6 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
 ) -> None:
     words = ["encode", data, "-o", tmp_path / "run.fhz", "--effort", "2", "--force", "-q"]
     report = json.loads(fhash(*words, "--json").stdout)
-    assert set(report) >= {*KEYS, "gains"}
     assert report["profile"] == "compact"
     assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(
         report["gains"]
@@ -80,7 +74,6 @@ def test_missed_promise_writes_the_file_prints_the_figures_and_exits_with_3(
     assert fhash("verify", output).exit_code == 0
     if as_json:
         report = json.loads(result.stdout)
-        assert set(report) >= KEYS
         assert report["psnr"] < 300
     else:
         assert str(output) in result.stdout

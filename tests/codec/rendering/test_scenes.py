@@ -15,8 +15,8 @@ from PIL import Image as Pictures
 from PIL import ImageColor
 from PIL.PngImagePlugin import PngInfo
 
-from fhash_codec.rendering.colour_maps import COLOUR_MAPS
 from fhash_codec.rendering.colours import (
+    COLOUR_MAPS,
     PIECES,
     SPACES,
     ColourMap,

@@ -494,7 +494,6 @@ def test_a_medium_that_is_drawn_out_mixes_sooner() -> None:
     assert wound > 2 * at_rest > 0
 
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "howto" / "simulate.md"
 NAMED = "advection vortex rotation front fingers diffusion turbulence buoyancy shell blob"
 
 
@@ -504,37 +503,6 @@ def test_all_effects_are_there_and_off_by_strength() -> None:
         assert effect.role in ("flow", "body", "bend", "spread")
         assert not effect_of({"effect": kind}, 1).idle
         assert effect_of({"effect": kind, "strength": 0}, 1).idle == "its strength is 0"
-
-
-def documented() -> dict[str, dict[str, tuple[str, str, str]]]:
-    """Rows of the tables in the document, by effect and setting: default, range, meaning."""
-    tables = {}
-    for section in DOCUMENT.read_text(encoding="utf-8").split("\n### ")[1:]:
-        rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|$", section, re.M)
-        tables[section.split("`")[1]] = {name: (*rest,) for name, *rest in rows}
-    return tables
-
-
-def text_of(value: Any) -> str:
-    if isinstance(value, tuple):
-        return ", ".join(f"{part:g}" for part in value)
-    return value if isinstance(value, str) else f"{value:g}"
-
-
-def test_the_document_has_every_setting_with_its_default_and_range() -> None:
-    expected = {
-        kind: {
-            setting.name: (
-                text_of(setting.default),
-                ", ".join(setting.metadata["choices"])
-                or f"{setting.metadata['low']:g} to {setting.metadata['high']:g}",
-                setting.metadata["help"],
-            )
-            for setting in dataclasses.fields(effect)
-        }
-        for kind, effect in EFFECTS.items()
-    }
-    assert documented() == expected
 
 
 @pytest.mark.parametrize(
@@ -635,24 +603,6 @@ def test_the_number_of_effects_is_limited() -> None:
 def test_a_scene_without_a_paper_shape_says_which_have_one() -> None:
     with pytest.raises(InputError, match="flame, bubble, shell do"):
         scene_of("vortex").as_in_paper()
-
-
-def test_the_document_has_every_setting_of_a_scene() -> None:
-    text = DOCUMENT.read_text(encoding="utf-8").partition("## Settings of a scene")[2]
-    rows = re.findall(
-        r"^\| `(\w+)` \| [^|]* \| ([^|]*)\| ([^|]*) \|$", text.partition("## E")[0], re.M
-    )
-    limits = {
-        setting.name: setting.metadata
-        for setting in dataclasses.fields(SimulatedScene)
-        if setting.name != "effects"
-    }
-    assert {name: help for name, _, help in rows} == {
-        name: each["help"] for name, each in limits.items()
-    }
-    for name, allowed, _ in rows:
-        low, high = limits[name]["low"], limits[name]["high"]
-        assert allowed.strip() == ("" if low is None else f"{low:g} to {high:g}")
 
 
 PAPER = {

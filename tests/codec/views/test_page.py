@@ -33,7 +33,7 @@ from PIL import Image
 import fhash_codec
 from fhash_cli.main import program
 from fhash_codec import EncodeConfig
-from fhash_codec.rendering.colour_maps import COLOUR_MAPS
+from fhash_codec.rendering.colours import COLOUR_MAPS
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import SCENE_KEY, Scene, scene_in_png, text_in_png
 from fhash_codec.views.page import FOLDER, PRIORS, WIDGET, Page, embedded
