@@ -70,20 +70,11 @@ SETTINGS = {
     "demo --scene": "fhash_codec.simulation.scene.SimulatedScene",
 }
 """Records of settings that users write as files, or find in them."""
-ALSO = {
-    "AblateBench": ("rows",),
-    "Against": ("ratio",),
-    "Beside": ("ratio",),
-    "BreakEven": ("ratio", "pictures"),
-    "CaseResult": ("holds",),
-    "Encoded": ("measured",),
-    "Finding": ("holds",),
-    "LabelSize": ("ratio",),
-    "Playback": ("ratio",),
-    "RateBench": ("best_peers",),
-    "RenderBench": ("summary",),
-    "Switch": ("ratio",),
-}
+ALSO = """
+AblateBench.rows Against.ratio Beside.ratio BreakEven.ratio BreakEven.pictures CaseResult.holds
+Encoded.measured Finding.holds LabelSize.ratio Playback.ratio RateBench.best_peers
+RenderBench.summary Switch.ratio
+"""
 """Properties and methods of dataclasses whose values stand beside their fields in JSON."""
 ELSEWHERE = """
 fhash_bench.paper.printed.TableReport fhash_codec.cost.encodings.ModelsCompared
@@ -199,7 +190,8 @@ def _object(*records: Any) -> Schema:
     for record in records:
         told = _attributes(record)
         hints = typing.get_type_hints(record, localns=names, include_extras=True)
-        for name in ALSO.get(record.__name__, ()):
+        beside = (each.split(".") for each in ALSO.split())
+        for name in (name for owner, name in beside if owner == record.__name__):
             also = getattr(record, name)
             hints[name] = typing.get_type_hints(getattr(also, "fget", also))["return"]
             text = also.__doc__.partition("\n")[0].rstrip(".").replace("None", "null")

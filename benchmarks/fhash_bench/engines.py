@@ -63,18 +63,12 @@ GOALS = (40.0, 50.0)
 
 @dataclass(frozen=True, kw_only=True)
 class CurvePoint:
-    """The quality of a model in training.
+    """The quality of a model in training."""
 
-    Attributes:
-        seconds, cpu_seconds: of training until then, without the measurement of the quality.
-        epochs: passes over the coreset until then.
-        psnr: dB on bricks of the coreset; None for an exact model.
-    """
-
-    seconds: float
-    cpu_seconds: float
-    epochs: float
-    psnr: float | None
+    seconds: Annotated[float, "of training until then"]
+    cpu_seconds: Annotated[float, "of training until then"]
+    epochs: Annotated[float, "passes over the coreset until then"]
+    psnr: Annotated[float | None, "dB on bricks of the coreset; null for an exact model"]
 
 
 def seconds_to(curve: Sequence[CurvePoint], psnr: float) -> CurvePoint | None:
@@ -96,23 +90,14 @@ GPU_PRODUCTS = 10
 
 @dataclass(kw_only=True)
 class Peak:
-    """The best of several measurements of a rate.
+    """The best of several measurements of a rate."""
 
-    Attributes:
-        what: `multiply-adds`, `matrix product` or `copy`.
-        path: instructions of the processor; None where a library chooses them.
-        precision: number type; None for copies.
-        clock: `cpu`, seconds of one thread's processor, or `events`, seconds of the GPU.
-        gflops: 10^9 floating-point operations a second, two for a multiply-add; None for copies.
-        gb_s: 10^9 bytes a second, read and written; None for arithmetic.
-    """
-
-    what: str
-    path: str | None
-    precision: str | None
-    clock: str
-    gflops: float | None = None
-    gb_s: float | None = None
+    what: Annotated[str, "`multiply-adds`, `matrix product` or `copy`"]
+    path: Annotated[str | None, "instructions of the processor; null where a library chooses them"]
+    precision: Annotated[str | None, "number type; null for copies"]
+    clock: Annotated[str, "`cpu`, seconds of a processor, or `events`, of the GPU"]
+    gflops: Annotated[float | None, "10^9 operations a second; null for copies"] = None
+    gb_s: Annotated[float | None, "10^9 bytes a second, both ways; null for arithmetic"] = None
 
 
 class Peaks:

@@ -240,27 +240,17 @@ NOTES = (
 
 @dataclass(frozen=True, kw_only=True)
 class LabelSize:
-    """Figures of one series.
+    """Figures of one series."""
 
-    Attributes:
-        kind: its name.
-        dtype, shape: of the array (t, z, y, x).
-        distinct: number of different values.
-        raw_bytes: bytes of the array.
-        xz_bytes, fhash_bytes, codec_bytes: bytes of `xz -9e`, of the container, and of the codec
-            for Zarr.
-        seconds: time of encoding the container.
-    """
-
-    kind: str
-    dtype: str
-    shape: tuple[int, ...]
-    distinct: int
-    raw_bytes: int
-    xz_bytes: int
-    fhash_bytes: int
-    codec_bytes: int
-    seconds: float
+    kind: Annotated[str, "its name"]
+    dtype: Annotated[str, "number type"]
+    shape: Annotated[tuple[int, ...], "(t, z, y, x)"]
+    distinct: Annotated[int, "number of different values"]
+    raw_bytes: Annotated[int, "bytes of the array"]
+    xz_bytes: Annotated[int, "of `xz -9e`"]
+    fhash_bytes: Annotated[int, "of the container"]
+    codec_bytes: Annotated[int, "of the codec for Zarr"]
+    seconds: Annotated[float, "time of encoding the container"]
 
     @property
     def ratio(self) -> float:

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any
 
 from fhash_codec.cost.report import require_matplotlib
 from fhash_formats.errors import InputError
@@ -30,20 +30,14 @@ NETWORK_PARTS = ("streams", "break-even")
 
 @dataclass(frozen=True, kw_only=True)
 class Switch:
-    """An effect or an acceleration on and off, all else alike.
+    """An effect or an acceleration on and off, all else alike."""
 
-    Attributes:
-        name: its name. off_ms, on_ms: milliseconds of a picture.
-        counters_off, counters_on: counters of the last picture.
-        psnr: dB between the two pictures; None where they are equal or meant to differ.
-    """
-
-    name: str
-    off_ms: float
-    on_ms: float
-    counters_off: dict[str, int]
-    counters_on: dict[str, int]
-    psnr: float | None
+    name: Annotated[str, "its name"]
+    off_ms: Annotated[float, "milliseconds of a picture"]
+    on_ms: Annotated[float, "milliseconds of a picture"]
+    counters_off: Annotated[dict[str, int], "counters of the last picture"]
+    counters_on: Annotated[dict[str, int], "counters of the last picture"]
+    psnr: Annotated[float | None, "dB between the two; null where equal or meant to differ"]
 
     @property
     def ratio(self) -> float:
@@ -53,44 +47,28 @@ class Switch:
 
 @dataclass(frozen=True, kw_only=True)
 class Stream:
-    """One march.
+    """One march."""
 
-    Attributes:
-        mode: way to march. milliseconds: of a picture. passes, samples, evaluations: its counters.
-        budget: N_r, None for the number of rays.
-        psnr: dB to the picture of the cached march, None where nothing differs.
-        largest: largest difference to that picture, 0..1.
-    """
-
-    mode: str
-    budget: int | None
-    milliseconds: float
-    passes: int
-    samples: int
-    evaluations: int
-    psnr: float | None
-    largest: float
+    mode: Annotated[str, "way to march"]
+    budget: Annotated[int | None, "N_r, null for the number of rays"]
+    milliseconds: Annotated[float, "of a picture"]
+    passes: Annotated[int, "its counters"]
+    samples: Annotated[int, "its counters"]
+    evaluations: Annotated[int, "its counters"]
+    psnr: Annotated[float | None, "dB to the picture of the cached march; null where equal"]
+    largest: Annotated[float, "largest difference to that picture, 0..1"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class BreakEven:
-    """Pictures of one size by the cache and by adaptive ray marching through the model.
+    """Pictures of one size by the cache and by adaptive ray marching through the model."""
 
-    Attributes:
-        size: pixels along both sides.
-        first_ms: the cache, decoding included.
-        kept_ms: the cache with the frame kept.
-        arm_ms: adaptive ray marching, which keeps nothing.
-        evaluations: of the model.
-        auto: the mode that 'auto' takes.
-    """
-
-    size: int
-    first_ms: float
-    kept_ms: float
-    arm_ms: float
-    evaluations: int
-    auto: str
+    size: Annotated[int, "pixels along both sides"]
+    first_ms: Annotated[float, "the cache, decoding included"]
+    kept_ms: Annotated[float, "the cache with the frame kept"]
+    arm_ms: Annotated[float, "adaptive ray marching, which keeps nothing"]
+    evaluations: Annotated[int, "of the model"]
+    auto: Annotated[str, "the mode that 'auto' takes"]
 
     @property
     def ratio(self) -> float:
@@ -110,28 +88,18 @@ class BreakEven:
 class Against:
     """A scene drawn here and by VTK's fixed-point ray caster.
 
-    Both have the same decoded frame, transfer function, camera, step and number of threads.
+    Both have the same decoded frame, transfer function, camera, step and number of threads."""
 
-    Attributes:
-        scene: its name. shaded: whether it is lit. size: pixels along both sides.
-        ours_ms: time of marching.
-        whole_ms: time of `Renderer.render`, planning included.
-        vtk_ms: time of VTK's `Render` less `window_ms`.
-        window_ms: time of VTK's `Render` with an empty window.
-        psnr, ssim: likeness of the pictures, PSNR in dB.
-        samples: values that were looked up here.
-    """
-
-    scene: str
-    shaded: bool
-    size: int
-    ours_ms: float
-    whole_ms: float
-    vtk_ms: float
-    window_ms: float
-    psnr: float | None
-    ssim: float
-    samples: int
+    scene: Annotated[str, "its name"]
+    shaded: Annotated[bool, "whether it is lit"]
+    size: Annotated[int, "pixels along both sides"]
+    ours_ms: Annotated[float, "time of marching"]
+    whole_ms: Annotated[float, "time of `Renderer.render`, planning included"]
+    vtk_ms: Annotated[float, "time of VTK's `Render` less `window_ms`"]
+    window_ms: Annotated[float, "time of VTK's `Render` with an empty window"]
+    psnr: Annotated[float | None, "likeness in dB"]
+    ssim: Annotated[float, "likeness"]
+    samples: Annotated[int, "values that were looked up here"]
 
     @property
     def ratio(self) -> float:
@@ -141,25 +109,16 @@ class Against:
 
 @dataclass(frozen=True, kw_only=True)
 class Beside:
-    """A volume made for the bench, drawn here and by a peer in turns.
+    """A volume made for the bench, drawn here and by a peer in turns."""
 
-    Attributes:
-        peer: name and version.
-        scene: its name. shaded: whether it is lit. size: pixels along both sides.
-        threads: of both.
-        ours_ms: time of marching.
-        peer_ms: time of the peer, less that of its empty window where it has one.
-        psnr: likeness of the pictures in dB, None where they are equal.
-    """
-
-    peer: str
-    scene: str
-    shaded: bool
-    size: int
-    threads: int
-    ours_ms: float
-    peer_ms: float
-    psnr: float | None
+    peer: Annotated[str, "name and version"]
+    scene: Annotated[str, "its name"]
+    shaded: Annotated[bool, "whether it is lit"]
+    size: Annotated[int, "pixels along both sides"]
+    threads: Annotated[int, "of both"]
+    ours_ms: Annotated[float, "time of marching"]
+    peer_ms: Annotated[float, "time of the peer, less that of its empty window"]
+    psnr: Annotated[float | None, "likeness in dB; null where equal"]
 
     @property
     def ratio(self) -> float:
@@ -169,45 +128,28 @@ class Beside:
 
 @dataclass(frozen=True, kw_only=True)
 class Exactness:
-    """A picture drawn here and by VTK's mapper for graphics cards.
+    """A picture drawn here and by VTK's mapper for graphics cards."""
 
-    Attributes:
-        scene: its name. size: pixels along both sides.
-        gradient: what the picture here is lit by, `cell` or `central` (as VTK); empty where it is
-            unlit.
-        step: ray step in vertex spacings.
-        psnr, ssim, largest: likeness; PSNR in dB, largest difference in bytes.
-        explained: PSNR of VTK's picture to a slow one with VTK's conventions for samples, gradients
-            and highlights, at a coarser step.
-    """
-
-    scene: str
-    gradient: str
-    size: int
-    step: float
-    psnr: float | None
-    ssim: float
-    largest: int
-    explained: float | None
+    scene: Annotated[str, "its name"]
+    gradient: Annotated[str, "lighting here, `cell` or `central` (as VTK); empty where unlit"]
+    size: Annotated[int, "pixels along both sides"]
+    step: Annotated[float, "ray step in vertex spacings"]
+    psnr: Annotated[float | None, "likeness in dB"]
+    ssim: Annotated[float, "likeness"]
+    largest: Annotated[int, "largest difference in bytes"]
+    explained: Annotated[float | None, "PSNR of VTK's picture to a slow one with VTK's conventions"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Playback:
-    """Steps drawn one after the other, each for the first time.
+    """Steps drawn one after the other, each for the first time."""
 
-    Attributes:
-        scene: its name. shaded: whether it is lit. size: pixels along both sides.
-        steps: their number.
-        ours_ms: milliseconds of a step, decoding included.
-        vtk_ms: those of VTK, whose frames are decoded; loading them included.
-    """
-
-    scene: str
-    shaded: bool
-    size: int
-    steps: int
-    ours_ms: float
-    vtk_ms: float
+    scene: Annotated[str, "its name"]
+    shaded: Annotated[bool, "whether it is lit"]
+    size: Annotated[int, "pixels along both sides"]
+    steps: Annotated[int, "their number"]
+    ours_ms: Annotated[float, "milliseconds of a step, decoding included"]
+    vtk_ms: Annotated[float, "those of VTK, whose frames are decoded; loading them included"]
 
     @property
     def ratio(self) -> float:
@@ -217,18 +159,13 @@ class Playback:
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """One setting of a knob.
+    """One setting of a knob."""
 
-    Attributes:
-        knob, value: what is set. milliseconds: of a picture. samples: its counter.
-        psnr: dB to the picture of the finest setting, None where they are equal.
-    """
-
-    knob: str
-    value: float
-    milliseconds: float
-    samples: int
-    psnr: float | None
+    knob: Annotated[str, "what is set"]
+    value: Annotated[float, "what is set"]
+    milliseconds: Annotated[float, "of a picture"]
+    samples: Annotated[int, "its counter"]
+    psnr: Annotated[float | None, "dB to the picture of the finest setting; null where equal"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,94 +46,57 @@ OWN = "fhash "
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """The smallest size at which a codec reached a quality, or the closest it came.
+    """The smallest size at which a codec reached a quality, or the closest it came."""
 
-    Attributes:
-        codec: name of a peer, or "fhash PROFILE".
-        goal: "psnr" (dB) or "bound" (share of the range).
-        asked: the quality.
-        reached: whether the codec reached it.
-        bytes, psnr, max_error: figures of the file; psnr in dB, None where exact, max_error as a
-            share of the range.
-        setting: setting in words.
-        as_asked: for a bound, whether the codec's own tolerance of that bound kept it; None where
-            it has no such setting.
-    """
-
-    codec: str
-    goal: str
-    asked: float
-    reached: bool
-    bytes: int
-    psnr: float | None
-    max_error: float
-    setting: str
-    as_asked: bool | None
+    codec: Annotated[str, "name of a peer, or 'fhash PROFILE'"]
+    goal: Annotated[str, "`psnr` (dB) or `bound` (share of the range)"]
+    asked: Annotated[float, "the quality"]
+    reached: Annotated[bool, "whether the codec reached it"]
+    bytes: Annotated[int, "of the file"]
+    psnr: Annotated[float | None, "dB; null where exact"]
+    max_error: Annotated[float, "share of the range"]
+    setting: Annotated[str, "setting in words"]
+    as_asked: Annotated[bool | None, "for a bound, whether the codec's own tolerance kept it"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Speed:
-    """Speed of a codec at a quality in 10^6 bytes of raw data a second, the best of some runs.
+    """Speed of a codec at a quality in 10^6 bytes of raw data a second, the best of some runs."""
 
-    Attributes:
-        codec, setting: as of `Point`. psnr: dB.
-        encode_mb_s, decode_mb_s: by the clock on the wall.
-        encode_core_mb_s, decode_core_mb_s: by the time of all cores, so those of one.
-        encode_runs: runs of encoding.
-    """
-
-    codec: str
-    setting: str
-    psnr: float | None
-    encode_mb_s: float
-    decode_mb_s: float
-    encode_core_mb_s: float
-    decode_core_mb_s: float
-    encode_runs: int
+    codec: Annotated[str, "as of a point"]
+    setting: Annotated[str, "as of a point"]
+    psnr: Annotated[float | None, "dB"]
+    encode_mb_s: Annotated[float, "by the clock on the wall"]
+    decode_mb_s: Annotated[float, "by the clock on the wall"]
+    encode_core_mb_s: Annotated[float, "by the time of all cores, so those of one"]
+    decode_core_mb_s: Annotated[float, "by the time of all cores, so those of one"]
+    encode_runs: Annotated[int, "runs of encoding"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Access:
-    """Access to a small region of one step: medians over random places.
+    """Access to a small region of one step: medians over random places."""
 
-    Attributes:
-        codec, setting: as of `Point`.
-        region: lengths (z, y, x).
-        bytes: size of all the data in this layout.
-        psnr: dB of all the data.
-        milliseconds: by the clock on the wall. core_milliseconds: of all cores together.
-        bytes_read: bytes that one region takes.
-    """
-
-    codec: str
-    setting: str
-    region: tuple[int, int, int]
-    bytes: int
-    psnr: float | None
-    milliseconds: float
-    core_milliseconds: float
-    bytes_read: int
+    codec: Annotated[str, "as of a point"]
+    setting: Annotated[str, "as of a point"]
+    region: Annotated[tuple[int, int, int], "lengths (z, y, x)"]
+    bytes: Annotated[int, "size of all the data in this layout"]
+    psnr: Annotated[float | None, "dB of all the data"]
+    milliseconds: Annotated[float, "by the clock on the wall"]
+    core_milliseconds: Annotated[float, "of all cores together"]
+    bytes_read: Annotated[int, "bytes that one region takes"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TilePrice:
-    """Bytes of the default tiles of fhash beside those of one tile, at a quality.
+    """Bytes of the default tiles of fhash beside those of one tile, at a quality."""
 
-    Attributes:
-        goal, asked: the quality, as of `Point`.
-        bytes: of the file as it is encoded.
-        one_tile_bytes: of a file with one tile.
-        price: the first over the second.
-        steps: of the series that were encoded for both; fewer than it has where one tile would be
-            too large.
-    """
-
-    goal: str
-    asked: float
-    bytes: int
-    one_tile_bytes: int
-    price: float
-    steps: int
+    goal: Annotated[str, "as of a point"]
+    asked: Annotated[float, "as of a point"]
+    bytes: Annotated[int, "of the file as it is encoded"]
+    one_tile_bytes: Annotated[int, "of a file with one tile"]
+    price: Annotated[float, "the first over the second"]
+    steps: Annotated[int, "of the series that were encoded for both"]
 
 
 class BestPeer(TypedDict):
@@ -148,31 +111,21 @@ class BestPeer(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class RateBench:
-    """Everything that `bench_rate` measured.
+    """Everything that `bench_rate` measured."""
 
-    Attributes:
-        series: source and variable. shape: (t, z, y, x). dtype: number type.
-        raw_bytes: size of the array. value_range: smallest and largest value.
-        tiles: price of the tiles of the profile compact at each quality.
-        missing: number of values that are not finite. Lossy peers were given neighbouring values in
-            their place.
-        refused: for each codec or variant that could not be measured, the reason.
-        machine: the machine. notes: how the figures were taken.
-    """
-
-    series: str
-    shape: tuple[int, ...]
-    dtype: str
-    raw_bytes: int
-    value_range: tuple[float, float]
-    missing: int
-    points: tuple[Point, ...]
-    speeds: tuple[Speed, ...]
-    access: tuple[Access, ...]
-    tiles: tuple[TilePrice, ...]
-    refused: dict[str, str]
-    machine: dict[str, Any]
-    notes: tuple[str, ...]
+    series: Annotated[str, "source and variable"]
+    shape: Annotated[tuple[int, ...], "(t, z, y, x)"]
+    dtype: Annotated[str, "number type"]
+    raw_bytes: Annotated[int, "size of the array"]
+    value_range: Annotated[tuple[float, float], "smallest and largest value"]
+    missing: Annotated[int, "number of values that are not finite"]
+    points: Annotated[tuple[Point, ...], "size of each codec at each quality"]
+    speeds: Annotated[tuple[Speed, ...], "speed of each codec"]
+    access: Annotated[tuple[Access, ...], "access to a small region"]
+    tiles: Annotated[tuple[TilePrice, ...], "price of the tiles of the profile compact"]
+    refused: Annotated[dict[str, str], "reasons by codec that could not be measured"]
+    machine: Annotated[dict[str, Any], "date, command line, processor, load, versions and more"]
+    notes: Annotated[tuple[str, ...], "how the figures were taken"]
 
     def best_peers(self) -> list[BestPeer]:
         """The best peer at each quality, beside fhash."""

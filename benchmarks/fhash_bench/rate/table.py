@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -58,37 +58,25 @@ class Request:
 
 @dataclass(frozen=True, kw_only=True)
 class RateCell:
-    """Figures of a codec on a series at a quality.
+    """Figures of a codec on a series at a quality."""
 
-    Attributes:
-        series, shape, dtype, raw_bytes: the series.
-        codec: name of a peer, or of fhash with its effort and its access.
-        goal, asked: the quality: `psnr` in dB, or `bound` as a share of the range.
-        reached: whether the codec reached it; where it did not, the other figures are of its
-            closest trial.
-        bytes, psnr, max_error, setting: as of `Point`; None where nothing was measured.
-        encode_mb_s, decode_mb_s: 10^6 bytes for each second of the processor.
-        region_ms: milliseconds of the processor for a region. region_bytes: as of `Access`.
-        why: why nothing was measured.
-    """
-
-    series: str
-    shape: tuple[int, ...]
-    dtype: str
-    raw_bytes: int
-    codec: str
-    goal: str
-    asked: float
-    reached: bool
-    bytes: int | None = None
-    encode_mb_s: float | None = None
-    decode_mb_s: float | None = None
-    region_ms: float | None = None
-    region_bytes: int | None = None
-    psnr: float | None = None
-    max_error: float | None = None
-    setting: str = ""
-    why: str = ""
+    series: Annotated[str, "as it was named"]
+    shape: Annotated[tuple[int, ...], "(t, z, y, x)"]
+    dtype: Annotated[str, "number type"]
+    raw_bytes: Annotated[int, "size of the array"]
+    codec: Annotated[str, "name of a peer, or of fhash with its effort and its access"]
+    goal: Annotated[str, "`psnr` in dB, or `bound`"]
+    asked: Annotated[float, "dB, or share of the range"]
+    reached: Annotated[bool, "whether the codec reached it; if not, figures of its closest trial"]
+    bytes: Annotated[int | None, "of the file; null where nothing was measured"] = None
+    encode_mb_s: Annotated[float | None, "10^6 bytes for each second of the processor"] = None
+    decode_mb_s: Annotated[float | None, "likewise"] = None
+    region_ms: Annotated[float | None, "of the processor, for a region"] = None
+    region_bytes: Annotated[int | None, "that one region takes"] = None
+    psnr: Annotated[float | None, "dB; null where exact"] = None
+    max_error: Annotated[float | None, "share of the range"] = None
+    setting: Annotated[str, "in words"] = ""
+    why: Annotated[str, "why nothing was measured"] = ""
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""
@@ -132,21 +120,13 @@ Search = Callable[[Bench], object]
 
 @dataclass(frozen=True, kw_only=True)
 class RateTable:
-    """Cells of every series, quality and codec.
+    """Cells of every series, quality and codec."""
 
-    Attributes:
-        cells: in the order in which they were asked for.
-        measured: how many of them were measured in this run; the others were there.
-        startup_seconds: of the processor, for a whole `fhash encode` of 16 values, which the
-            speed of encoding does not hold.
-        machine: this machine. notes: how the figures were taken.
-    """
-
-    cells: tuple[RateCell, ...]
-    measured: int
-    startup_seconds: float
-    machine: dict[str, Any]
-    notes: tuple[str, ...] = NOTES
+    cells: Annotated[tuple[RateCell, ...], "in the order in which they were asked for"]
+    measured: Annotated[int, "those measured in this run"]
+    startup_seconds: Annotated[float, "of the processor, for `fhash encode` of 16 values"]
+    machine: Annotated[dict[str, Any], "this machine"]
+    notes: Annotated[tuple[str, ...], "how the figures were taken"] = NOTES
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""
