@@ -25,6 +25,7 @@ from fhash_codec.cost.plan import (
     cropped,
     described,
     facts_of,
+    options_of,
 )
 from fhash_codec.cost.prediction import Prediction, predictor
 from fhash_codec.cost.probe import reported
@@ -101,7 +102,6 @@ class OwnEncodings:
         self.files: list[KeptFile] = []
         self._ratios: list[float] = []
         self._predictions: dict[EncodeConfig, Prediction] = {}
-        self._fastest = prod(series.shape) / USUAL_RATE
         self._usual: dict[int, float] = {}
         self._predicting = 0.0
 
@@ -145,15 +145,11 @@ class OwnEncodings:
         if config.effort in self._usual:
             return self._usual[config.effort]
         if prediction is not None:
-            return prediction.seconds * self._scale
-        return self._usual.get(1, self._fastest) * USUAL_SECONDS[config.effort]
-
-    @property
-    def _scale(self) -> float:
-        """Factor by which this machine, under its present load, differs from the predictions."""
-        if not self._ratios:
-            return 1.0
-        return min(max(median(self._ratios), 1 / MAX_SCALE), MAX_SCALE)
+            # This machine, under its present load, differs from the predictions by a factor.
+            usual = median(self._ratios or [1.0])
+            return prediction.seconds * min(max(usual, 1 / MAX_SCALE), MAX_SCALE)
+        fastest = self._usual.get(1, prod(self._series.shape) / USUAL_RATE)
+        return fastest * USUAL_SECONDS[config.effort]
 
     def _encode(self, wish: Wish, point: Encoded, share: float) -> Encoded:
         """Encode, and keep the file; the point as predicted where that failed.
@@ -193,7 +189,10 @@ class OwnEncodings:
 
 def _predicted(wish: Wish, prediction: Prediction | None) -> Encoded:
     """The point of a wish before it is measured."""
-    point = Encoded(name=wish.name, codec=wish.codec, group=wish.group, options=wish.options)
+    assert wish.config is not None
+    point = Encoded(
+        name=wish.name, codec=wish.codec, group=wish.group, options=options_of(wish.config)
+    )
     if prediction is None:
         return point
     return replace(

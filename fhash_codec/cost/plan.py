@@ -282,11 +282,6 @@ class Wish:
     target: float = 0.0
 
     @property
-    def options(self) -> str:
-        """Options of `fhash encode` that give the encoding; empty for a peer and the defaults."""
-        return "" if self.config is None else options_of(self.config)
-
-    @property
     def name(self) -> str:
         """The encoding in words."""
         if self.config is None:
@@ -304,7 +299,7 @@ class Wish:
 
 
 def options_of(config: EncodeConfig) -> str:
-    """Options of `fhash encode` that give settings, for a shell."""
+    """Options of `fhash encode` that give settings, for a shell; empty for the defaults."""
     words = []
     for field in dataclasses.fields(config):
         name, value = EncodeConfig.label(field), getattr(config, field.name)

@@ -11,9 +11,9 @@ import json
 import os
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -32,6 +32,7 @@ from fhash_codec.cost.results import (
     conclusion,
     feature_options,
     seconds_text,
+    told,
     trusted,
 )
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
@@ -59,22 +60,6 @@ SYMBOLS = ("o", "s", "D", "^", "X", "*", "P")
 """Markers of curves that have none of their own."""
 
 
-@dataclass(frozen=True)
-class Axis:
-    """An axis.
-
-    Attributes:
-        label: what it shows, with its unit.
-        unit: "B" for bytes, which are shown as kB and MB; empty for plain numbers.
-        log: whether it is logarithmic. reversed: whether small values lie above.
-    """
-
-    label: str
-    unit: str = ""
-    log: bool = False
-    reversed: bool = False
-
-
 class Point(NamedTuple):
     """A point of a curve, or a bar of length x at the name y.
 
@@ -97,23 +82,24 @@ class Panel:
 
     Attributes:
         section: one of SECTIONS; empty for that beside the advice.
+        x, y: labels of the axes, with units.
         curves: the points of each curve, by its name.
+        log: names of the logarithmic axes, such as "xy".
         line: whether the points of a curve are joined.
         bars: whether the points are horizontal bars.
         diagonal: whether a line shows where x equals y.
-        ringed: a point with a ring, and its text beside it.
     """
 
     key: str
     section: str
     title: str
-    x: Axis
-    y: Axis
+    x: str
+    y: str
     curves: dict[str, list[Point]]
+    log: str = ""
     line: bool = True
     bars: bool = False
     diagonal: bool = False
-    ringed: Point | None = None
 
 
 def curves(points: Iterable[Point]) -> dict[str, list[Point]]:
@@ -135,44 +121,37 @@ PREDICTED = ", predicted"
 """End of the name of a curve of predictions, whose points are hollow and not joined."""
 BOUND = ", error bound"
 """End of the name of a curve of strict bounds, whose points are not joined: their dB follow."""
-SIZE = Axis("size of the file, bytes", unit="B", log=True)
-"""Bytes of a file."""
-TIME = Axis("milliseconds", log=True)
-"""Time of a read or a picture."""
+SIZE = "size of the file, bytes"
+"""Label of the size."""
+TIME = "milliseconds"
+"""Label of the time of a read or a picture."""
+ERROR = "largest error"
+"""Beginning of the label of an axis on which small values lie above."""
 
 
 def encode_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the encodings, empty ones included."""
-    units = f", {report.units}" if report.units not in ("", "1") else ", in the units of the data"
-    decibel, middle = Axis("PSNR of all values, dB"), Axis("PSNR of the middle 98 %, dB")
-    error = Axis(f"largest error{units}", log=True, reversed=True)
-    seconds = Axis("seconds of encoding", log=True)
+    units = report.units if report.units not in ("", "1") else "in the units of the data"
+    decibel = "PSNR of all values, dB"
     points = report.encodings
     if len(points) > 1:
-        ringed = next(
-            (
-                Point("", point.seconds, point.psnr, f"default: {_hover(point).splitlines()[1]}")
-                for point in points
-                if point.name == DEFAULT and point.seconds and point.psnr is not None
-            ),
-            None,
-        )
         title = "Quality against time; large points are large files"
         made = _frontier(points, "seconds", "psnr")
-        yield Panel("answer", "", title, seconds, decibel, made, ringed=ringed)
-        for key, title, y, field in (
-            ("encode-bytes", "Accuracy against size", decibel, "psnr"),
-            ("encode-bulk", "Accuracy of the bulk against size", middle, "psnr_bulk"),
-            ("encode-error", "Largest error against size", error, "max_abs_error"),
+        yield Panel("answer", "", title, "seconds of encoding", decibel, made, log="x")
+        for key, title, y, field, log in (
+            ("bytes", "Accuracy", decibel, "psnr", "x"),
+            ("bulk", "Accuracy of the bulk", "PSNR of the middle 98 %, dB", "psnr_bulk", "x"),
+            ("error", "Largest error", f"{ERROR}, {units}", "max_abs_error", "xy"),
         ):
-            yield Panel(key, "encode", title, SIZE, y, _frontier(points, "bytes", field))
-    x, y = Axis("seconds predicted", log=True), Axis("seconds measured", log=True)
-    both = [point for point in points if point.seconds and point.predicted_seconds]
+            made, title = _frontier(points, "bytes", field), f"{title} against size"
+            yield Panel(f"encode-{key}", "encode", title, SIZE, y, made, log=log)
     made = curves(
-        Point(each.group, each.predicted_seconds, each.seconds, _hover(each)) for each in both
+        Point(each.group, each.predicted_seconds, each.seconds, _hover(each))
+        for each in points
+        if each.predicted_seconds and each.measured
     )
-    title = "Predicted and measured time"
-    yield Panel("predicted", "encode", title, x, y, made, line=False, diagonal=True)
+    title, x, y = "Predicted and measured time", "seconds predicted", "seconds measured"
+    yield Panel("predicted", "encode", title, x, y, made, log="xy", line=False, diagonal=True)
     yield from _courses(report)
 
 
@@ -196,53 +175,41 @@ def _frontier(points: Sequence[Encoded], x: str, y: str) -> dict[str, list[Point
 
 def _hover(point: Encoded) -> str:
     """Text that the mouse shows at an encoding."""
-    lines = [point.name]
-    for kind in ("", "predicted_"):
-        seconds, size, psnr = (
-            getattr(point, f"{kind}{name}") for name in ("seconds", "bytes", "psnr")
-        )
-        if seconds is not None:
-            parts = [seconds_text(seconds)]
-            parts += [] if size is None else [bytes_text(size)]
-            parts += [] if psnr is None else [f"{psnr:.2f} dB"]
-            lines.append(("predicted: " if kind else "") + ", ".join(parts))
+    lines = [point.name, told(point)] if point.measured else [point.name]
+    if point.predicted_seconds is not None:
+        size, psnr = point.predicted_bytes, point.predicted_psnr
+        foretold = replace(point, seconds=point.predicted_seconds, bytes=size, psnr=psnr)
+        lines.append(f"predicted: {told(foretold)}")
     return "\n".join(lines + ["misses its promise"] * point.missed)
 
 
 def _courses(report: CostReport) -> Iterator[Panel]:
     """The trainings, and what the stages and steps of one encoding have."""
-    x, y = Axis("seconds of training", log=True), Axis("PSNR on samples, dB")
     made = curves(
-        Point(
-            one.name, at["seconds"] or 0, at["psnr"], f"{one.name}\nepoch or update {at['epoch']:g}"
-        )
+        Point(one.name, at["seconds"], at["psnr"], f"{one.name}\nepoch or update {at['epoch']:g}")
         for one in report.curves
         for at in one.points
     )
-    yield Panel("training", "training", "Course of the trainings", x, y, made)
+    title, x, y = "Course of the trainings", "seconds of training", "PSNR on samples, dB"
+    yield Panel("training", "training", title, x, y, made, log="x")
     made = curves(
         Point("", stage.seconds, stage.stage, f"{stage.stage}\n{seconds_text(stage.seconds)}")
         for stage in reversed(report.stages)
     )
-    title = "Seconds of each stage"
-    yield Panel("stages", "encode", title, Axis("seconds"), Axis(""), made, bars=True)
+    yield Panel("stages", "encode", "Seconds of each stage", "seconds", "", made, bars=True)
     steps = [
         Point("", at["step"], at["psnr"], f"step {at['step']}: {at['psnr']:.4g} dB")
         for at in report.per_step
         if at["psnr"] is not None
     ]
     made = {"": steps} if steps else {}
-    title = "Accuracy of each step"
-    yield Panel("per-step", "encode", title, Axis("step"), Axis("PSNR, dB"), made)
+    yield Panel("per-step", "encode", "Accuracy of each step", "step", "PSNR, dB", made)
 
 
 def read_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the reads, empty ones included."""
-    y = Axis("PSNR of what was read, dB")
-    for key, title, x, field in (
-        ("read-ms", "Accuracy of reads against time", TIME, "milliseconds"),
-        ("read-bytes", "Accuracy of reads against bytes", BYTES_READ, "bytes_read"),
-    ):
+    y = "PSNR of what was read, dB"
+    for key, x, field in (("ms", TIME, "milliseconds"), ("bytes", "bytes read", "bytes_read")):
         made = curves(
             Point(
                 read.what,
@@ -253,34 +220,32 @@ def read_panels(report: CostReport) -> Iterator[Panel]:
             )
             for read in report.reads
         )
-        yield Panel(key, "read", title, x, y, made, line=False)
+        title = f"Accuracy of reads against {x}"
+        yield Panel(f"read-{key}", "read", title, x, y, made, log="x", line=False)
 
 
-BYTES_READ = Axis("bytes read", unit="B", log=True)
-"""Bytes that a read takes of a file."""
 KNOBS = ("step length", "level of detail", "level of detail, first picture", "threshold")
 """Groups of pictures that trade time for likeness."""
 
 
 def picture_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the pictures, empty ones included."""
-    for key, title, label, field in (
-        ("picture-psnr", "likeness against time", "PSNR to the finest picture, dB", "psnr"),
-        ("picture-ssim", "SSIM against time", "SSIM to the finest picture", "ssim"),
+    for title, y, field in (
+        ("Pictures: likeness against time", "PSNR to the finest picture, dB", "psnr"),
+        ("Pictures: SSIM against time", "SSIM to the finest picture", "ssim"),
     ):
         made = curves(  # in the order of the settings: times alone may go up and down
             Point(each.group, each.milliseconds, getattr(each, field), _seen(each))
             for each in report.pictures
             if each.group in KNOBS and not each.best
         )
-        yield Panel(key, "picture", f"Pictures: {title}", TIME, Axis(label), made)
+        yield Panel(f"picture-{field}", "picture", title, TIME, y, made, log="x")
     made = curves(
         Point("", each.milliseconds, each.setting, _seen(each))
         for each in reversed(report.pictures)
         if each.group == "effect"
     )
-    x, y = Axis("milliseconds"), Axis("")
-    yield Panel("effects", "picture", "Effects, each alone", x, y, made, bars=True)
+    yield Panel("effects", "picture", "Effects, each alone", TIME, "", made, bars=True)
     files = {point.name: point for point in report.encodings if point.bytes}
     made = curves(
         sorted(
@@ -289,8 +254,8 @@ def picture_panels(report: CostReport) -> Iterator[Panel]:
             if each.group == "encoding" and each.setting in files and each.psnr is not None
         )
     )
-    title, y = "Likeness to the source's picture against size", Axis("PSNR of the picture, dB")
-    yield Panel("picture-bytes", "picture", title, SIZE, y, made)
+    title, y = "Likeness to the source's picture against size", "PSNR of the picture, dB"
+    yield Panel("picture-bytes", "picture", title, SIZE, y, made, log="x")
 
 
 def _seen(picture: Picture) -> str:
@@ -435,21 +400,18 @@ def _draw(axes: Any, panel: Panel) -> list[str]:
                             facecolors="none" if hollow else colour,
                             label=("_" if name.endswith(BOUND) else "") + name)  # fmt: skip
         made.set_urls(links)
+        for at in (point[1:3] for point in points if point.text.startswith(DEFAULT)):
+            axes.scatter(*at, s=260, facecolors="none", edgecolors=INK, linewidths=1.3, zorder=4)
+            axes.annotate("default", at, (11, 9), textcoords="offset points", fontweight="bold")
     if panel.diagonal:
         ends = [end for points in panel.curves.values() for point in points for end in point[1:3]]
         axes.plot(*[[min(ends), max(ends)]] * 2, color=INK, linestyle=":", linewidth=1)
-    _scale(axes, panel.x, "x")
-    _scale(axes, panel.y, "y")
-    if panel.ringed is not None:
-        _, *at, text, _ = panel.ringed
-        axes.scatter(*at, s=260, facecolors="none", edgecolors=INK, linewidths=1.3, zorder=4)
-        low, high = axes.get_xlim()
-        side = (
-            -1 if at[0] ** 2 > low * high else 1
-        )  # in the left half of seconds, by their logarithm
-        beside = axes.annotate(text, at, (11 * side, 10), textcoords="offset points", zorder=5,
-                               ha="right" if side < 0 else "left", fontweight="bold")  # fmt: skip
-        beside.set_in_layout(False)
+    for name, label in (("x", panel.x), ("y", panel.y)):
+        getattr(axes, f"set_{name}label")(label)
+        if name in panel.log:
+            _set_logarithmic(axes, name, bytes_text if "bytes" in label else "{:g}".format)
+    if panel.y.startswith(ERROR):
+        axes.invert_yaxis()
     axes.set_title(panel.title, fontsize=9.5)
     axes.grid(True, which="major", color=LINE, linewidth=0.8)
     axes.set_axisbelow(True)
@@ -460,21 +422,16 @@ def _draw(axes: Any, panel: Panel) -> list[str]:
     return texts
 
 
-def _scale(axes: Any, axis: Axis, name: str) -> None:
-    """Label and scale of one axis."""
-    getattr(axes, f"set_{name}label")(axis.label)
-    if axis.log:
-        getattr(axes, f"set_{name}scale")("log")
-        side = getattr(axes, f"{name}axis")
-        shown = bytes_text if axis.unit else "{:g}".format
-        side.set_major_formatter(lambda value, _: shown(value))
-        side.set_minor_formatter(lambda *_: "")
-        low, high = sorted(getattr(axes, f"get_{name}lim")())
-        marks = (1, 2, 5) if high < FEW_DECADES * low else (1,)
-        ticker = importlib.import_module("matplotlib.ticker")
-        side.set_major_locator(ticker.LogLocator(subs=marks, numticks=20))
-    if axis.reversed:
-        getattr(axes, f"invert_{name}axis")()
+def _set_logarithmic(axes: Any, name: str, shown: Callable[[float], str]) -> None:
+    """Make one axis logarithmic, with texts for its marks."""
+    getattr(axes, f"set_{name}scale")("log")
+    side = getattr(axes, f"{name}axis")
+    side.set_major_formatter(lambda value, _: shown(value))
+    side.set_minor_formatter(lambda *_: "")
+    low, high = sorted(getattr(axes, f"get_{name}lim")())
+    marks = (1, 2, 5) if high < FEW_DECADES * low else (1,)
+    ticker = importlib.import_module("matplotlib.ticker")
+    side.set_major_locator(ticker.LogLocator(subs=marks, numticks=20))
 
 
 def require_matplotlib() -> Any:
@@ -521,8 +478,7 @@ def page(report: CostReport) -> str:
 
 
 def _title(report: CostReport) -> str:
-    series = report.series.replace(os.path.dirname(report.series) + "/", "", 1)
-    return f"What accuracy costs: {series}"
+    return f"What accuracy costs: {report.series}"
 
 
 def _command(report: CostReport) -> str:

@@ -256,7 +256,8 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
     """The best of what was measured for each accuracy, by aim.
 
     The aims are the fastest and the smallest encoding of this package, and the smallest with the
-    default effort. Predictions do not count, and an accuracy that nothing reaches is left out.
+    default effort. Predictions do not count, and an accuracy that nothing reaches is left out. For
+    a largest error only encodings count that promise one: others keep it by chance.
 
     Args:
         points: measured encodings, and predicted ones.
@@ -265,13 +266,18 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
     own = [point for point in points if point.measured and point.codec in OWN]
     usual = next((point.group for point in own if point.name == DEFAULT), None)
     found = []
-    for psnr, share in (*((psnr, None) for psnr in TARGETS), *((None, share) for share in ERRORS)):
+    goals = [*((psnr, None) for psnr in TARGETS), *((0.0, share) for share in ERRORS)]
+    for psnr, share in goals:
+        bound = math.inf if share is None else share * width * (1 + 1e-9)  # it is rounded itself
         reached = [
             point
             for point in own
             if point.exact
-            or (psnr is not None and (point.psnr or 0.0) >= psnr)
-            or (share is not None and _within(point, share * width))
+            or (
+                (share is None or "--max-error" in point.options)
+                and (point.psnr or 0.0) >= psnr
+                and (math.inf if point.max_abs_error is None else point.max_abs_error) <= bound
+            )
         ]
         for aim, best in (
             ("fastest", _best(reached, "seconds", "bytes", AS_FAST)),
@@ -282,14 +288,15 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
                 names = ("name", "options", "seconds", "bytes", "region_ms")
                 figures: dict[str, Any] = {name: getattr(best, name) for name in names}
                 found.append(
-                    Advice(psnr=psnr, max_error_rel=share, aim=aim, reached=best.psnr, **figures)
+                    Advice(
+                        psnr=psnr or None,
+                        max_error_rel=share,
+                        aim=aim,
+                        reached=best.psnr,
+                        **figures,
+                    )
                 )
     return tuple(found)
-
-
-def _within(point: Encoded, bound: float) -> bool:
-    """Whether no error exceeds a bound, but for the rounding of the bound itself."""
-    return point.max_abs_error is not None and point.max_abs_error <= bound * (1 + 1e-9)
 
 
 def smallest(points: Sequence[Encoded]) -> Encoded | None:
@@ -344,16 +351,16 @@ def feature_options(report: CostReport) -> list[str]:
 
 
 def conclusion(report: CostReport) -> str:
-    """What was measured, in one sentence; empty where the default settings were not."""
+    """One sentence on what was measured; empty where the default settings were not."""
     points = {point.name: point for point in report.encodings if point.measured}
     usual, network = points.get(DEFAULT), points.get(NETWORK)
     if usual is None:
         return ""
     data = "the data" if report.measured_shape == report.shape else "this crop of the data"
     ratio = f"{usual.ratio:,.{0 if (usual.ratio or 0) > 99 else 1}f}"
-    parts = [f"The default settings make {data} {ratio} times smaller: {_told(usual)}"]
+    parts = [f"The default settings make {data} {ratio} times smaller: {told(usual)}"]
     parts += [
-        f"the fastest for 50 dB, {advice.options}: {_told(points[advice.name])}"
+        f"the fastest for 50 dB, {advice.options}: {told(points[advice.name])}"
         for advice in report.advice
         if (advice.psnr, advice.aim) == (50.0, "fastest") and advice.name not in (DEFAULT, NETWORK)
     ]
@@ -364,16 +371,16 @@ def conclusion(report: CostReport) -> str:
         and (point.exact or (usual.psnr is not None and (point.psnr or 0.0) >= usual.psnr))
     ]
     if (peer := smallest(peers)) is not None:
-        parts.append(f"the smallest peer, {peer.codec}: {_told(peer)}")
+        parts.append(f"the smallest peer, {peer.codec}: {told(peer)}")
     if network is not None:
-        parts.append(f"the network: {_told(network)}")
+        parts.append(f"the network: {told(network)}")
     return "; ".join(parts) + "."
 
 
-def _told(point: Encoded) -> str:
-    """Figures of a measured encoding."""
-    quality = "exact" if point.psnr is None else f"{point.psnr:.1f} dB"
-    return f"{bytes_text(point.bytes or 0)}, {seconds_text(point.seconds or 0.0)}, {quality}"
+def told(point: Encoded) -> str:
+    """Size, time and quality of an encoding."""
+    quality = ", exact" if point.exact else "" if point.psnr is None else f", {point.psnr:.1f} dB"
+    return f"{bytes_text(point.bytes or 0)}, {seconds_text(point.seconds or 0.0)}{quality}"
 
 
 NEAR = 1.25
@@ -389,10 +396,7 @@ def trusted(points: Sequence[Encoded]) -> set[str]:
     worst: dict[str, list[float]] = {}
     for point in points:
         if point.measured and point.predicted_seconds is not None:
-            pairs = (
-                (point.seconds, point.predicted_seconds),
-                (point.bytes, point.predicted_bytes),
-            )
+            pairs = (point.seconds, point.predicted_seconds), (point.bytes, point.predicted_bytes)
             ratios = [a / b if a and b else math.inf for a, b in pairs]
             worst.setdefault(point.group, []).append(max(max(ratio, 1 / ratio) for ratio in ratios))
     return {group for group, each in worst.items() if len(each) >= 2 and max(each) <= NEAR}

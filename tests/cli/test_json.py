@@ -213,7 +213,7 @@ def test_cost() -> None:
         pictures=(Picture(group="effect", setting="a", milliseconds=1.0, counters={"rays": 0},
                           psnr=None, ssim=None),),
         advice=(Advice(psnr=40.0, aim="smallest", name="a", options="", seconds=1.0, bytes=9,
-                       reached=None),),
+                       region_ms=None, reached=None),),
         left_out=(LeftOut(what="a", why="b"),), machine={}, notes=("a",),
     )  # fmt: skip
     check("cost", json.loads(json.dumps({"paths": ["a"], **result.to_dict()})))

@@ -24,9 +24,6 @@ from fhash_formats.errors import InputError, InterruptedEncodingError, OutputErr
 if TYPE_CHECKING:
     from fhash_codec.cost.results import CostReport
 
-COLUMNS = 100
-"""Width of the texts in a terminal."""
-
 
 @click.command("cost", cls=BaseCommand)
 @click.argument("data", type=click.Path())
@@ -98,7 +95,7 @@ def report_text(report: CostReport, paths: list[Path]) -> str:
     """The conclusion, the table of advice, what was left out, and where the report is."""
     from fhash_codec.cost.results import ADVICE, advice_rows, conclusion, feature_options
 
-    lines = [*textwrap.wrap(conclusion(report), COLUMNS), ""]
+    lines = [*textwrap.wrap(conclusion(report), 100), ""]
     if report.advice:
         lines += table([ADVICE, *advice_rows(report)], left=True).splitlines()
         lines += [f"each with {option}" for option in feature_options(report)]
