@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -41,7 +43,7 @@ from fhash_codec.cost.uses import PictureCosts, measure_reads
 from fhash_codec.features.selection import Source, mask_files, open_source, select_features
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashError, InputError
 from fhash_formats.series import Series
 
 BUDGET = 120.0
@@ -57,7 +59,7 @@ ADVICE_ENCODINGS = 10
 PROBED_VERTICES = 1 << 21
 """Vertices of the crop from which these times are foretold."""
 MIN_VERTICES = 1 << 14
-"""Vertices of the smallest crop."""
+"""Vertices below which a crop is not made smaller."""
 MAX_READ_FILES = 8
 """Files that reads are measured from, at most."""
 NOTES = (
@@ -80,7 +82,6 @@ NOTES = (
     "the fastest is the smallest file of those within 25 % of the fewest seconds, the smallest the"
     " fastest of those within 1 % of the fewest bytes, the default the smallest of its effort",
     "with features, errors count in them alone, and a peer encodes all vertices",
-    "a region is 16^3 vertices, with the opening of the file; the median of 5 random places",
 )
 
 
@@ -175,14 +176,18 @@ def _measurable(
     network = replace(config, profile="paper")
     progress("predicting", 0, 1, "")
     with predictor(part) as foretold:
-        seconds = ADVICE_ENCODINGS * foretold.predict(config).seconds / share
-    seconds += sum(probe_paper(part, share, network).stage_seconds(network).values())
+        lattice = ADVICE_ENCODINGS * foretold.predict(config).seconds / share
+    probe = None
+    with suppress(FhashError):  # told where the network is encoded
+        probe = probe_paper(part, share, network)
     progress("predicting", 1, 1, "")
-    allowed = ADVICE_SHARE * budget
-    if seconds <= allowed:
-        return whole
-    vertices = max(int(prod(whole.shape) * allowed / seconds), MIN_VERTICES)
-    return cropped(whole, vertices, extent.box)
+    kept = 1.0
+    while kept * prod(whole.shape) > MIN_VERTICES:
+        training = () if probe is None else probe.of_share(kept).stage_seconds(network).values()
+        if kept * lattice + sum(training) <= ADVICE_SHARE * budget:
+            break
+        kept *= 0.8
+    return cropped(whole, math.ceil(kept * prod(whole.shape)), extent.box)
 
 
 def measure_uses(

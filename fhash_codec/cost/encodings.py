@@ -49,8 +49,6 @@ from fhash_formats.series import Series, StepsSeries
 
 ONE_SHARE = 0.6
 """Share of the time left for encoding that one encoding may take, so that others follow."""
-MAX_SCALE = 4.0
-"""Largest factor between measured and predicted seconds that later predictions are scaled by."""
 PREDICT_SHARE = 0.05
 """Share of the budget that predicting may take; without a prediction USUAL_SECONDS serve."""
 USUAL_RATE = 2e6
@@ -146,8 +144,7 @@ class OwnEncodings:
             return self._usual[config.effort]
         if prediction is not None:
             # This machine, under its present load, differs from the predictions by a factor.
-            usual = median(self._ratios or [1.0])
-            return prediction.seconds * min(max(usual, 1 / MAX_SCALE), MAX_SCALE)
+            return prediction.seconds * median(self._ratios or [1.0])
         fastest = self._usual.get(1, prod(self._series.shape) / USUAL_RATE)
         return fastest * USUAL_SECONDS[config.effort]
 

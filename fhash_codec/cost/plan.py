@@ -143,11 +143,6 @@ class Facts:
         """Power of two that brings differences of values near 1."""
         return power_of_two(self.width)
 
-    @property
-    def scaled_width(self) -> float:
-        """Width of the range after scaling."""
-        return self.width * self.scale
-
     def errors(self) -> Errors:
         """Errors without a frame yet."""
         return Errors(self.width, self.bulk)

@@ -27,6 +27,7 @@ from fhash_codec.cost.results import (
     CostReport,
     Encoded,
     Picture,
+    Read,
     advice_rows,
     bytes_text,
     conclusion,
@@ -103,10 +104,10 @@ class Panel:
 
 
 def curves(points: Iterable[Point]) -> dict[str, list[Point]]:
-    """The curves of some points; those that lack x or y, or are at x = 0, are left out."""
+    """The curves of some points; those that lack x or y are left out."""
     made: dict[str, list[Point]] = {}
     for point in points:
-        if point.x and point.y is not None:
+        if point.x is not None and point.y is not None:
             made.setdefault(point.curve, []).append(point)
     return made
 
@@ -130,7 +131,7 @@ ERROR = "largest error"
 
 
 def encode_panels(report: CostReport) -> Iterator[Panel]:
-    """Plots of the encodings, empty ones included."""
+    """Plots of the encodings, their trainings, stages and steps, empty ones included."""
     units = report.units if report.units not in ("", "1") else "in the units of the data"
     decibel = "PSNR of all values, dB"
     points = report.encodings
@@ -152,7 +153,24 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
     )
     title, x, y = "Predicted and measured time", "seconds predicted", "seconds measured"
     yield Panel("predicted", "encode", title, x, y, made, log="xy", line=False, diagonal=True)
-    yield from _courses(report)
+    made = curves(
+        Point(one.name, at["seconds"], at["psnr"], f"{one.name}\nepoch or update {at['epoch']:g}")
+        for one in report.curves
+        for at in one.points
+    )
+    title, x, y = "Course of the trainings", "seconds of training", "PSNR on samples, dB"
+    yield Panel("training", "training", title, x, y, made, log="x")
+    made = curves(
+        Point("", stage.seconds, stage.stage, f"{stage.stage}\n{seconds_text(stage.seconds)}")
+        for stage in reversed(report.stages)
+        if stage.times
+    )
+    yield Panel("stages", "encode", "Seconds of each stage", "seconds", "", made, bars=True)
+    made = curves(
+        Point("", at["step"], at["psnr"], f"step {at['step']}: {at['psnr'] or 0:.4g} dB")
+        for at in report.per_step
+    )
+    yield Panel("per-step", "encode", "Accuracy of each step", "step", "PSNR, dB", made)
 
 
 def _frontier(points: Sequence[Encoded], x: str, y: str) -> dict[str, list[Point]]:
@@ -183,45 +201,21 @@ def _hover(point: Encoded) -> str:
     return "\n".join(lines + ["misses its promise"] * point.missed)
 
 
-def _courses(report: CostReport) -> Iterator[Panel]:
-    """The trainings, and what the stages and steps of one encoding have."""
-    made = curves(
-        Point(one.name, at["seconds"], at["psnr"], f"{one.name}\nepoch or update {at['epoch']:g}")
-        for one in report.curves
-        for at in one.points
-    )
-    title, x, y = "Course of the trainings", "seconds of training", "PSNR on samples, dB"
-    yield Panel("training", "training", title, x, y, made, log="x")
-    made = curves(
-        Point("", stage.seconds, stage.stage, f"{stage.stage}\n{seconds_text(stage.seconds)}")
-        for stage in reversed(report.stages)
-    )
-    yield Panel("stages", "encode", "Seconds of each stage", "seconds", "", made, bars=True)
-    steps = [
-        Point("", at["step"], at["psnr"], f"step {at['step']}: {at['psnr']:.4g} dB")
-        for at in report.per_step
-        if at["psnr"] is not None
-    ]
-    made = {"": steps} if steps else {}
-    yield Panel("per-step", "encode", "Accuracy of each step", "step", "PSNR, dB", made)
-
-
 def read_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the reads, empty ones included."""
     y = "PSNR of what was read, dB"
     for key, x, field in (("ms", TIME, "milliseconds"), ("bytes", "bytes read", "bytes_read")):
         made = curves(
-            Point(
-                read.what,
-                getattr(read, field),
-                read.psnr,
-                f"{read.what}\n{read.file}\n{read.milliseconds:.3g} ms,"
-                f" {bytes_text(read.bytes_read)}",
-            )
-            for read in report.reads
+            Point(read.what, getattr(read, field), read.psnr, _read(read)) for read in report.reads
         )
         title = f"Accuracy of reads against {x}"
         yield Panel(f"read-{key}", "read", title, x, y, made, log="x", line=False)
+
+
+def _read(read: Read) -> str:
+    """Text that the mouse shows at a read."""
+    figures = f"{read.milliseconds:.3g} ms, {bytes_text(read.bytes_read)}"
+    return f"{read.what}\n{read.file}\n{figures}"
 
 
 KNOBS = ("step length", "level of detail", "level of detail, first picture", "threshold")
@@ -317,8 +311,11 @@ LINE = "#d9dde3"
 RC = {
     "font.size": 8.5, "text.color": INK, "axes.edgecolor": LINE, "axes.labelcolor": INK,
     "xtick.color": INK, "ytick.color": INK, "svg.fonttype": "none", "svg.hashsalt": "fhash",
+    "text.parse_math": False,  # names and units of the data are none
 }  # fmt: skip
 """Settings of matplotlib for all plots."""
+TITLE = "What accuracy costs: "
+"""Beginning of the title, before the series."""
 FEW_DECADES = 300
 """Ratio of the ends of a logarithmic axis up to which 2 and 5 have marks, too."""
 
@@ -329,18 +326,18 @@ def plot(report: CostReport, path: Path) -> None:
     Raises MissingDependencyError without matplotlib.
     """
     module = require_matplotlib()
-    shown = panels(report)[:2]
+    shown = panels(report)[: 1 if report.advice else 2]
     with importlib.import_module("matplotlib").rc_context(RC):
         figure = module.Figure(figsize=(12.8, 6.4), layout="constrained", dpi=100)
-        figure.suptitle("\n".join([_title(report), *textwrap.wrap(conclusion(report), 150)]))
-        left, right = figure.subplots(1, 2, width_ratios=(5, 6))
-        for axes, panel in zip((left, right), shown, strict=False):
+        title = [TITLE + report.series, *textwrap.wrap(conclusion(report), 150)]
+        figure.suptitle("\n".join(title))
+        both = figure.subplots(1, 2, width_ratios=(5, 6))
+        for axes, panel in zip(both, shown, strict=False):
             _draw(axes, panel)
-        if report.advice or len(shown) < 2:
-            right.clear()
-            right.set_axis_off()
+        for axes in both[len(shown) :]:
+            axes.set_axis_off()
         if report.advice:
-            _draw_advice(right, report)
+            _draw_advice(both[1], report)
         figure.savefig(path, format="png")
 
 
@@ -366,19 +363,16 @@ def svg(panel: Panel) -> str:
     with importlib.import_module("matplotlib").rc_context(RC):
         figure = module.Figure(figsize=(5.0, 4.1), layout="constrained")
         texts = _draw(figure.subplots(), panel)
-        written = io.StringIO()
-        figure.savefig(written, format="svg", transparent=True, metadata={"Date": None})
-    element = written.getvalue()
-    element = (
-        element[element.index("<svg") :].replace(INK, "var(--ink)").replace(LINE, "var(--line)")
-    )
+        written, unsaid = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(written, format="svg", transparent=True, metadata=unsaid)
+    _, start, rest = written.getvalue().partition("<svg")
+    element = (start + rest).replace(INK, "var(--ink)").replace(LINE, "var(--line)")
     # matplotlib has links for its points, and no titles.
-    element = re.sub(
+    return re.sub(
         r'<a xlink:href="(\d+)"[^>]*>',
         lambda found: f"<g><title>{escape(texts[int(found[1])])}</title>",
-        element,
+        element.replace("</a>", "</g>"),
     )
-    return re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.S).replace("</a>", "</g>")
 
 
 def _draw(axes: Any, panel: Panel) -> list[str]:
@@ -465,7 +459,7 @@ def page(report: CostReport) -> str:
     made = panels(report)
     answer = "".join(_figure(panel) for panel in made if not panel.section)
     filled = {
-        "title": escape(_title(report)),
+        "title": escape(TITLE + report.series),
         "conclusion": escape(conclusion(report)),
         "facts": escape(_facts(report)),
         "answer": answer + (_advice(report) if report.advice else ""),
@@ -475,10 +469,6 @@ def page(report: CostReport) -> str:
     }
     template = files("fhash_codec.cost").joinpath("page.html").read_text(encoding="utf-8")
     return Template(template).substitute(filled)
-
-
-def _title(report: CostReport) -> str:
-    return f"What accuracy costs: {report.series}"
 
 
 def _command(report: CostReport) -> str:

@@ -318,8 +318,7 @@ ADVICE = ("accuracy", "encoding", "time", "size", "16^3 region", "options")
 def advice_rows(report: CostReport) -> list[tuple[str, ...]]:
     """The table of advice: a row for each accuracy and encoding, with all its aims in one cell.
 
-    The accuracy stands in the first of its rows alone. The features are those of all rows, and left
-    out of the options.
+    The accuracy stands in the first of its rows alone; options leave out the features of all rows.
     """
     common = " ".join(feature_options(report))
     rows: dict[tuple[str, str], list[Advice]] = {}

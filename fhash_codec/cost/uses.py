@@ -199,7 +199,7 @@ def _measured(series: Series, file: KeptFile, kind: _Kind, facts: Facts) -> Read
         values=values.size,
         milliseconds=1e3 * median(taken),
         bytes_read=round(median(touched)),
-        psnr=psnr(facts.scaled_width, rmse),
+        psnr=psnr(facts.width * facts.scale, rmse),
         max_abs_error=largest / facts.scale if count else None,
     )
 

@@ -228,7 +228,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     wish = Wish(codec="compact", group="g", config=EncodeConfig(effort=1, psnr=40.0))
     prediction = Prediction(seconds=0.01, bytes=9, psnr=40.0, basis="")
     monkeypatch.setattr(cost, "wishes", lambda features: iter([wish]))
-    training = SimpleNamespace(stage_seconds=lambda config: {"training": 0.0})
+    training = SimpleNamespace(
+        of_share=lambda kept: training, stage_seconds=lambda config: {"a": 0.0}
+    )
     monkeypatch.setattr(cost, "probe_paper", lambda *_: training)
     foretold = SimpleNamespace(predict=lambda config: prediction)
     monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(foretold))

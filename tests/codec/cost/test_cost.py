@@ -56,7 +56,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
             return Prediction(seconds=self.seconds, bytes=9, psnr=40.0, basis="")
 
     monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(Foretold(series)))
-    training = SimpleNamespace(stage_seconds=lambda config: {"training": 0.0})
+    training = SimpleNamespace(
+        of_share=lambda kept: training, stage_seconds=lambda config: {"a": 0.0}
+    )
     monkeypatch.setattr(cost, "probe_paper", lambda *_: training)
     monkeypatch.setattr(cost, "wishes", few)
     drawn = SimpleNamespace(measure=lambda series, files: None)

@@ -255,7 +255,16 @@ def test_a_plot_has_the_colours_of_the_theme(report: CostReport) -> None:
 
 
 def test_the_plots_are_drawn_in_colours(report: CostReport, tmp_path: Path) -> None:
-    less = replace(report, reads=(), pictures=(), per_step=(), stages=(), curves=())
+    less = replace(
+        report,
+        series="a_$ wave_$",
+        units="m$^",
+        reads=(),
+        pictures=(),
+        per_step=(),
+        stages=(),
+        curves=(),
+    )
     plot(less, tmp_path / "cost.png")
     with Image.open(tmp_path / "cost.png") as picture:
         assert len(picture.convert("RGB").getcolors(2**24)) > 50
