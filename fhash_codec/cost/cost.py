@@ -54,7 +54,7 @@ READ_END = 0.8
 """Share of the budget at which reading ends."""
 ADVICE_SHARE = 0.55
 """Share of the budget in which the advice should be measured, else of a crop."""
-ADVICE_ENCODINGS = 10
+ADVICE_ENCODINGS = 6
 """Time of the encodings for the advice but the network, as a multiple of the default settings'."""
 PROBED_VERTICES = 1 << 21
 """Vertices of the crop from which these times are foretold."""
@@ -79,8 +79,8 @@ NOTES = (
     " group, those by encoding with the picture of the source",
     "hollow points are predicted, not measured; they are drawn where seconds and bytes of all that"
     " was measured at the same effort lay within 25 % of their predictions",
-    "the fastest is the smallest file of those within 25 % of the fewest seconds, the smallest the"
-    " fastest of those within 1 % of the fewest bytes, the default the smallest of its effort",
+    "the fastest exceeds its accuracy by less than 5 dB where possible, the smallest is the fastest"
+    " of those within 1 % of the fewest bytes, the default the smallest of its effort",
     "with features, errors count in them alone, and a peer encodes all vertices",
 )
 

@@ -244,8 +244,8 @@ TARGETS = (40.0, 45.0, 50.0, 60.0)
 """Accuracies in dB that are advised for."""
 ERRORS = (0.01, 0.001)
 """Largest errors that are advised for, as fractions of the range."""
-AS_FAST = 1.25
-"""Factor on the fewest seconds within which the smallest file is the fastest: times are noisy."""
+CLOSE = 5.0
+"""Excess in dB up to which the fastest is looked for first: times are noisy, and sizes count."""
 AS_SMALL = 1.01
 """Factor on the fewest bytes within which the fastest encoding is the smallest."""
 UNITS = ("B", "kB", "MB", "GB")
@@ -279,8 +279,9 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
                 and (math.inf if point.max_abs_error is None else point.max_abs_error) <= bound
             )
         ]
+        close = [point for point in reached if _excess(point, psnr, bound) < CLOSE]
         for aim, best in (
-            ("fastest", _best(reached, "seconds", "bytes", AS_FAST)),
+            ("fastest", min(close or reached, key=lambda point: point.seconds or 0, default=None)),
             ("smallest", smallest(reached)),
             ("default", smallest([point for point in reached if point.group == usual])),
         ):
@@ -299,16 +300,18 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
     return tuple(found)
 
 
+def _excess(point: Encoded, psnr: float, bound: float) -> float:
+    """Excess in dB of an encoding over the accuracy asked for, a PSNR or else a bound."""
+    if psnr:
+        return math.inf if point.psnr is None else point.psnr - psnr
+    return 20 * math.log10(bound / point.max_abs_error) if point.max_abs_error else math.inf
+
+
 def smallest(points: Sequence[Encoded]) -> Encoded | None:
     """The smallest of some measured encodings, the fastest of those of nearly its size."""
-    return _best(points, "bytes", "seconds", AS_SMALL)
-
-
-def _best(points: Sequence[Encoded], first: str, second: str, near: float) -> Encoded | None:
-    """The point with the least of a second figure among those near the least of a first one."""
-    least = min((getattr(point, first) for point in points), default=0.0)
-    able = [point for point in points if getattr(point, first) <= near * least]
-    return min(able, key=lambda point: getattr(point, second) or 0.0, default=None)
+    least = min((point.bytes or 0 for point in points), default=0)
+    able = [point for point in points if (point.bytes or 0) <= AS_SMALL * least]
+    return min(able, key=lambda point: point.seconds or 0.0, default=None)
 
 
 ADVICE = ("accuracy", "encoding", "time", "size", "16^3 region", "options")
@@ -363,13 +366,9 @@ def conclusion(report: CostReport) -> str:
         for advice in report.advice
         if (advice.psnr, advice.aim) == (50.0, "fastest") and advice.name not in (DEFAULT, NETWORK)
     ]
-    peers = [
-        point
-        for point in points.values()
-        if point.codec not in OWN
-        and (point.exact or (usual.psnr is not None and (point.psnr or 0.0) >= usual.psnr))
-    ]
-    if (peer := smallest(peers)) is not None:
+    peers = [point for point in points.values() if point.codec not in OWN]
+    peer = smallest([each for each in peers if _excess(each, usual.psnr or math.inf, 0.0) >= 0])
+    if peer is not None:
         parts.append(f"the smallest peer, {peer.codec}: {told(peer)}")
     if network is not None:
         parts.append(f"the network: {told(network)}")

@@ -210,6 +210,21 @@ def test_every_group_is_measured(series: ArraySeries, tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.usefixtures("small")
+def test_a_picture_of_a_feature_is_compared_with_that_feature(
+    series: ArraySeries, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.fhz"
+    encode(series, path, EncodeConfig(effort=1, max_error=0.0, features=("onset:0.5",)))
+    made: list[Picture] = []
+    with open_volume(path) as volume:
+        assert not volume.occupancy(2).all()
+        files = [KeptFile(name="exact", path=path, psnr=None)]
+        PictureCosts(volume, Allowance(1000.0), silent, made).measure(series, files)
+    (picture,) = [each for each in made if (each.group, each.setting) == ("encoding", "exact")]
+    assert (picture.psnr, picture.ssim) == (None, pytest.approx(1.0))
+
+
 @pytest.fixture
 def file(series: ArraySeries, tmp_path: Path) -> KeptFile:
     """A file that holds the series exactly."""

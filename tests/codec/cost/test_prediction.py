@@ -51,6 +51,7 @@ from fhash_codec.cost.prediction import (
 from fhash_codec.cost.probe import PaperProbe, look_at, probe_rates, updates_of
 from fhash_codec.cost.results import DEFAULT, NETWORK, CostReport, Encoded, advise, bytes_text
 from fhash_codec.encoding import encode
+from fhash_codec.paper.train import usual_batches
 from fhash_codec.progress import silent
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InterruptedEncodingError, RegionError
@@ -106,6 +107,17 @@ def test_a_batch_of_another_size_makes_other_steps() -> None:
     pytest.importorskip("torch")
     config = EncodeConfig(profile="paper", epochs=10, batch=10_000)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * 100 + 0.25 * 10
+
+
+def test_a_share_of_a_series_has_its_samples_and_steps_of_their_size() -> None:
+    pytest.importorskip("torch")
+    half = PROBE.of_share(0.5)
+    assert (half.samples, half.bricks, half.bytes) == (50_000, 500, 500)
+    assert half.stages["scan"] == 0.5
+    before, after = (usual_batches(each.samples, each.bricks) for each in (PROBE, half))
+    per_sample = [each.step * n / each.samples for each, n in ((PROBE, before), (half, after))]
+    assert per_sample[0] == pytest.approx(per_sample[1])
+    assert PROBE.of_share(1.0) == PROBE
 
 
 @pytest.mark.parametrize("shape", [(4, 8, 24, 24), (1, 1, 40, 40), (3, 1, 1, 30), (2, 150, 8, 8)])
@@ -459,7 +471,7 @@ def point(name: str, codec: str, seconds: float | None, size: int, psnr: float |
 
 POINTS = [
     point("fast", "compact", 1.0, 2000, 46.0),
-    point("as fast", "compact", 1.1, 1900, 46.0),
+    point("faster", "compact", 0.9, 9900, 51.0),
     point("small", "compact", 9.0, 1000, 45.0),
     point("as small", "compact", 8.0, 1005, 45.0),
     point("peer", "SZ3", 0.1, 300, 46.0),
@@ -475,10 +487,10 @@ def told(points: Sequence[Encoded]) -> list[tuple[str, str, str]]:
 def test_fastest_smallest_and_default_of_what_reaches_an_accuracy() -> None:
     points = [replace(each, group=each.name if each.name != DEFAULT else "a") for each in POINTS]
     assert told(points)[3:7] == [
-        ("45 dB", "fastest", "as fast"),
+        ("45 dB", "fastest", "fast"),
         ("45 dB", "smallest", "as small"),
         ("45 dB", "default", DEFAULT),
-        ("50 dB", "fastest", DEFAULT),
+        ("50 dB", "fastest", "faster"),
     ]
     assert told(points)[-1] == ("60 dB", "default", DEFAULT)
     # Without one at the default effort there is no advice to take it.
@@ -488,7 +500,10 @@ def test_fastest_smallest_and_default_of_what_reaches_an_accuracy() -> None:
 def test_a_largest_error_must_be_promised() -> None:
     close = replace(POINTS[0], psnr=30.0, max_abs_error=0.1)
     bound = replace(close, name="bound", options="--max-error-rel 0.01")
-    assert told([close, bound]) == [("within 1 %", aim, "bound") for aim in ("fastest", "smallest")]
+    finer = replace(bound, name="finer", seconds=0.1, bytes=9000, max_abs_error=0.02)
+    assert told([close, bound, finer]) == [
+        ("within 1 %", aim, "bound") for aim in ("fastest", "smallest")
+    ]
     assert told([replace(bound, max_abs_error=0.1001)]) == []
     assert told([replace(bound, max_abs_error=None)]) == []
 
