@@ -325,18 +325,15 @@ def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
     yield own(5)
     network = EncodeConfig(profile="paper", features=features)
     yield Wish(codec="paper", group=NETWORK, config=network)
-    # First the rows of the advice. A peer takes several times the time that is shown for it, since
-    # it is led to its target.
-    for target in (50.0, 40.0, 60.0, 45.0):
-        yield own(1, psnr=target)
-        if target == 50.0:
-            yield from peers(target)
-        yield own(3, psnr=target)
-        if target != 50.0:
-            yield own(5, psnr=target)
-    for effort in (1, 5, 3):
+    yield own(1, psnr=50.0)
+    # A peer takes several times the time that is shown for it, since it is led to its target.
+    yield from peers(50.0)
+    # The rows of the advice: the fastest and the default of each, and then what may be smaller.
+    for efforts, targets in (((1, 5), (40.0, 60.0, 45.0)), ((3,), (50.0, 40.0, 60.0, 45.0))):
+        for target in targets:
+            yield from (own(effort, psnr=target) for effort in efforts)
         for share in (0.01, 0.001):
-            yield own(effort, error=share)
+            yield from (own(effort, error=share) for effort in efforts)
     for target in (40.0, 60.0, 45.0, 70.0):
         yield from peers(target)
     for effort in (1, 3):

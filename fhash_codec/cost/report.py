@@ -353,7 +353,7 @@ def _draw_advice(axes: Any, report: CostReport) -> None:
     for (row, column), cell in cells.get_celld().items():
         cell.set_edgecolor(LINE)
         bold = row == 0 or column == 0
-        cell.set_text_props(fontsize=7.5, fontweight="bold" if bold else "normal")
+        cell.set_text_props(fontsize=8.5, fontweight="bold" if bold else "normal")
     axes.set_title(_command(report), fontsize=8.5)
 
 
@@ -482,7 +482,7 @@ def _facts(report: CostReport) -> str:
     return (
         f"Measured: {report.measured}, {shape} (t, z, y, x), {report.dtype},"
         f" {bytes_text(report.raw_bytes)}; {report.seconds:.0f} s of a budget of"
-        f" {report.budget_seconds:g} s, {report.machine.get('threads', '?')} threads"
+        f" {report.budget_seconds:.0f} s, {report.machine.get('threads', '?')} threads"
         + (", interrupted: what was measured by then" if report.interrupted else "")
     )
 
