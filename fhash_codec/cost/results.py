@@ -337,7 +337,7 @@ def advice_rows(report: CostReport) -> list[tuple[str, ...]]:
                 ", ".join(entry.aim for entry in entries) if len(entries) < 3 else "all three",
                 seconds_text(one.seconds),
                 bytes_text(one.bytes),
-                "-" if one.region_ms is None else f"{one.region_ms:.2g} ms",
+                "-" if one.region_ms is None else seconds_text(one.region_ms, "ms"),
                 " ".join(one.options.replace(common, "").split()) or "none",
             )
         )
@@ -400,9 +400,9 @@ def trusted(points: Sequence[Encoded]) -> set[str]:
     return {group for group, each in worst.items() if len(each) >= 2 and max(each) <= NEAR}
 
 
-def seconds_text(seconds: float) -> str:
-    """Seconds in two digits, such as 0.43 s or 54 s."""
-    return f"{seconds:.2g} s" if seconds < 9.95 else f"{seconds:.0f} s"
+def seconds_text(seconds: float, unit: str = "s") -> str:
+    """Seconds, or another unit of time, in two digits or whole, such as 0.43 s or 154 s."""
+    return f"{seconds:.2g} {unit}" if seconds < 9.95 else f"{seconds:.0f} {unit}"
 
 
 def bytes_text(count: float) -> str:

@@ -49,7 +49,15 @@ from fhash_codec.cost.prediction import (
     choose,
 )
 from fhash_codec.cost.probe import PaperProbe, look_at, probe_rates, updates_of
-from fhash_codec.cost.results import DEFAULT, NETWORK, CostReport, Encoded, advise, bytes_text
+from fhash_codec.cost.results import (
+    DEFAULT,
+    NETWORK,
+    CostReport,
+    Encoded,
+    advise,
+    bytes_text,
+    seconds_text,
+)
 from fhash_codec.encoding import encode
 from fhash_codec.paper.train import usual_batches
 from fhash_codec.progress import silent
@@ -522,6 +530,14 @@ def test_exact_values_reach_every_accuracy() -> None:
 )
 def test_sizes_in_three_digits(count: float, text: str) -> None:
     assert bytes_text(count) == text
+
+
+def test_times_are_never_powers_of_ten() -> None:
+    assert [seconds_text(ms, "ms") for ms in (0.834, 12.4, 1234.0)] == [
+        "0.83 ms",
+        "12 ms",
+        "1234 ms",
+    ]
 
 
 def test_a_report_is_json_with_every_field(report: CostReport) -> None:
