@@ -48,10 +48,10 @@ from fhash_formats.series import Series
 
 BUDGET = 120.0
 """Seconds that are spent by default."""
-ENCODE_END = 0.65
-"""Share of the budget at which encoding ends."""
-READ_END = 0.8
-"""Share of the budget at which reading ends."""
+ENCODE_SHARE = 0.65
+"""Share of the time for further encodings, after those that are always measured."""
+READ_SHARE = 0.5
+"""Share of the time after encoding for reads; the rest is for pictures."""
 ADVICE_SHARE = 0.55
 """Share of the budget in which the advice should be measured, else of a crop."""
 ADVICE_ENCODINGS = 6
@@ -123,7 +123,6 @@ def measure_cost(
         peers = PeerEncodings(series, facts, Path(folder), allowance, progress)
         reads: list[Read] = []
         pictures: list[Picture] = []
-        allowance.part(ENCODE_END)
         with predictor(series) as foretold:
             own = OwnEncodings(series, Path(folder), allowance, foretold.predict, progress)
             with allowance.work("further encodings"):
@@ -152,9 +151,14 @@ def _encode(
     own: OwnEncodings, peers: PeerEncodings, allowance: Allowance, features: tuple[str, ...]
 ) -> None:
     """Measure every wish once, as far as time goes."""
+    every = list(wishes(features))
+    for wish in every:
+        if wish.always and not allowance.interrupted:
+            own.measure(wish)
+    allowance.part(ENCODE_SHARE)
     # What was too long for its share may fit into what the others left.
     for share in (ONE_SHARE, 1.0):
-        for wish in wishes(features):
+        for wish in every:
             if allowance.interrupted:
                 return
             if wish.codec in PEERS:
@@ -201,14 +205,13 @@ def measure_uses(
 ) -> None:
     """Measure reads from files and pictures of them; adds to `reads` and `pictures`.
 
-    The first part of the time, up to READ_END of the budget, is for reads. The pictures are of the
-    file with the default settings, or else of the first.
+    The pictures are of the file with the default settings, or else of the first.
     """
     if not files:
         return
     default = next((file for file in files if file.name == DEFAULT), files[0])
     others = [file for file in files if file is not default]
-    allowance.part(READ_END)
+    allowance.part(READ_SHARE)
     chosen = [default, *others][:MAX_READ_FILES]
     for read in measure_reads(series, chosen, facts, allowance, progress):
         reads.append(read)

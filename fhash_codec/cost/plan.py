@@ -63,9 +63,9 @@ class Allowance:
         """Seconds until the end of the present part, 0 at least."""
         return max(self._end - self.spent, 0.0)
 
-    def part(self, end: float) -> None:
-        """Begin a part that ends at a share of all seconds, 0 to 1."""
-        self._end = end * self.seconds
+    def part(self, share: float) -> None:
+        """Begin a part that may take a share, 0 to 1, of all seconds that are left."""
+        self._end = self.spent + share * max(self.seconds - self.spent, 0.0)
 
     def has(self, what: str, seconds: float, *, share: float = 1.0) -> bool:
         """Whether work of some seconds fits in a share of what is left of the part.

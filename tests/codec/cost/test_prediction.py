@@ -348,6 +348,8 @@ def test_a_part_ends_at_its_share_and_what_does_not_fit_is_told() -> None:
     assert not allowance.has("half", 16.0, share=0.5)
     clock.now = 70.0
     assert allowance.left == 0.0
+    allowance.part(0.5)
+    assert allowance.left == 15.0
     entry, _ = allowance.left_out
     assert (entry.what, entry.late) == ("long", True)
     assert "31 s" in entry.why
