@@ -80,7 +80,7 @@ def test_encodings_reads_and_advice(series: ArraySeries) -> None:
 def test_a_series_that_is_too_large_is_cropped(
     series: ArraySeries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cost, "ADVICE_SHARE", 5e-9 * series.values.size / 500.0)
+    monkeypatch.setattr(cost, "ADVICE_SHARE", 3e-9 * series.values.size / 500.0)
     monkeypatch.setattr(cost, "MIN_VERTICES", 1)
     report = measure_cost(series, budget=500.0)
     assert report.measured.startswith("a crop, ")
