@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
@@ -18,7 +18,6 @@ import numpy as np
 from fhash_codec.boxes import Box
 from fhash_codec.config import MODELS, EncodeConfig
 from fhash_codec.cost.plan import (
-    EPOCHS,
     MIN_STEPS,
     Allowance,
     Facts,
@@ -26,7 +25,7 @@ from fhash_codec.cost.plan import (
     cropped,
     described,
     facts_of,
-    paper_config,
+    options_of,
 )
 from fhash_codec.cost.prediction import Prediction, predictor
 from fhash_codec.cost.probe import reported
@@ -47,20 +46,13 @@ from fhash_formats.errors import (
     QualityError,
 )
 from fhash_formats.series import Series, StepsSeries
-from fhash_formats.transform.tile_format import Shape
 
 ONE_SHARE = 0.6
 """Share of the time left for encoding that one encoding may take, so that others follow."""
-MAX_SCALE = 4.0
-"""Largest factor between measured and predicted seconds that later predictions are scaled by."""
-DEFAULT_SHARE = 0.85
-"""Share that the default settings may take: most people will use them."""
-PREDICT_SHARE = 0.12
+PREDICT_SHARE = 0.05
 """Share of the budget that predicting may take; without a prediction USUAL_SECONDS serve."""
 USUAL_RATE = 2e6
 """Vertices a second of the fastest encoding, before one was measured."""
-USUAL_TRAINING = 3e5
-"""Samples a second of a training, before one was measured."""
 USUAL_SECONDS = {1: 1.0, 2: 3.0, 3: 5.0, 5: 15.0, 7: 40.0, 9: 80.0}
 """Rough seconds of each effort over those of effort 1."""
 
@@ -108,10 +100,8 @@ class OwnEncodings:
         self.files: list[KeptFile] = []
         self._ratios: list[float] = []
         self._predictions: dict[EncodeConfig, Prediction] = {}
-        self._fastest = prod(series.shape) / USUAL_RATE
-        self._usual: dict[str, float] = {}
+        self._usual: dict[int, float] = {}
         self._predicting = 0.0
-        self._share = ONE_SHARE
 
     def measure(self, wish: Wish, *, share: float = ONE_SHARE) -> None:
         """Measure a wish, or keep its prediction where there is no time for it.
@@ -120,50 +110,21 @@ class OwnEncodings:
 
         share: share of the time left that it may take.
         """
-        self._share = share
-        if wish.codec == "paper":
-            self._measure_paper(wish)
-        else:
-            self._measure(wish)
-
-    def _measure(self, wish: Wish) -> Encoded:
         assert wish.config is not None
         before = next((point for point in self.points if point.name == wish.name), None)
         if before is not None and before.measured:
-            return before
+            return
         with self._allowance.work(f"prediction of {wish.name}"):
             self._predict(wish.config)
         point = _predicted(wish, self._predictions.get(wish.config))
-        share = self._share
-        if wish.config == EncodeConfig():
-            share = max(share, DEFAULT_SHARE)
-        if self._allowance.has(wish.name, self._expected(wish.config), share=share):
+        expected = self._expected(wish.config)
+        if wish.always or self._allowance.has(wish.name, expected, share=share):
             with self._allowance.work(wish.name):
                 point = self._encode(wish, point, share)
         if before is not None:
             self.points.remove(before)
         if point.measured or point.predicted_seconds is not None:
             self.points.append(point)
-        return point
-
-    def _measure_paper(self, wish: Wish) -> None:
-        """Train one epoch, then as many as fit; the course of the longer training is a curve."""
-        if any(point.codec == "paper" and point.measured for point in self.points):
-            return
-        first = self._measure(replace(wish, config=paper_config(1)))
-        if not first.seconds or self._allowance.interrupted:
-            return
-        epoch = self.curves[-1].points[-1]["seconds"] or first.seconds
-        rest = max(first.seconds - epoch, 0.0)
-        # A training that is stopped leaves nothing: half of its share is for what goes wrong.
-        limit = 0.5 * self._share * self._allowance.left
-        fitting = [epochs for epochs in EPOCHS if rest + epochs * epoch <= limit]
-        if fitting:
-            config = paper_config(fitting[-1])
-            self._usual[_kind(config)] = rest + fitting[-1] * epoch
-            self._measure(replace(wish, config=config))
-        else:
-            self._allowance.has("paper, more epochs", max(rest + EPOCHS[0] * epoch, limit))
 
     def _predict(self, config: EncodeConfig) -> None:
         """Predict an encoding, unless predictions have taken their share of the time."""
@@ -178,30 +139,25 @@ class OwnEncodings:
 
     def _expected(self, config: EncodeConfig) -> float:
         """Seconds that an encoding will take: as one of its kind did, or by its prediction."""
-        kind, prediction = _kind(config), self._predictions.get(config)
-        if kind in self._usual:
-            return self._usual[kind]
+        prediction = self._predictions.get(config)
+        if config.effort in self._usual:
+            return self._usual[config.effort]
         if prediction is not None:
-            return prediction.seconds * self._scale
-        if config.profile == "paper":
-            return prod(self._series.shape) * config.epochs / USUAL_TRAINING
-        return self._usual.get("effort 1", self._fastest) * USUAL_SECONDS[config.effort]
-
-    @property
-    def _scale(self) -> float:
-        """Factor by which this machine, under its present load, differs from the predictions."""
-        if not self._ratios:
-            return 1.0
-        return min(max(median(self._ratios), 1 / MAX_SCALE), MAX_SCALE)
+            # This machine, under its present load, differs from the predictions by a factor.
+            return prediction.seconds * median(self._ratios or [1.0])
+        fastest = self._usual.get(1, prod(self._series.shape) / USUAL_RATE)
+        return fastest * USUAL_SECONDS[config.effort]
 
     def _encode(self, wish: Wish, point: Encoded, share: float) -> Encoded:
         """Encode, and keep the file; the point as predicted where that failed.
 
-        share: share of the time left after which the encoding is stopped.
+        share: share of the time left after which the encoding is stopped, unless it is made always.
         """
         assert wish.config is not None
         path = self._folder / f"{len(self.files)}.fhz"
-        guarded = self._allowance.guard(self._progress, share=share)
+        guarded = self._progress
+        if not wish.always:
+            guarded = self._allowance.guard(self._progress, share=share)
         missed = False
         try:
             with warnings.catch_warnings():
@@ -221,22 +177,19 @@ class OwnEncodings:
         self.files.append(KeptFile(name=measured.name, path=path, psnr=measured.psnr))
         if report["curve"]:
             self.curves.append(Curve(name=measured.name, points=tuple(report["curve"])))
-        self._usual[_kind(wish.config)] = report["seconds"]
-        if point.predicted_seconds and wish.codec == "compact":
-            self._ratios.append(report["seconds"] / point.predicted_seconds)
+        if wish.codec == "compact":
+            self._usual[wish.config.effort] = report["seconds"]
+            if point.predicted_seconds:
+                self._ratios.append(report["seconds"] / point.predicted_seconds)
         return measured
-
-
-def _kind(config: EncodeConfig) -> str:
-    """Name of the encodings that take about as long as one with these settings."""
-    if config.profile == "paper":
-        return f"paper, {config.epochs}"
-    return f"effort {config.effort}"
 
 
 def _predicted(wish: Wish, prediction: Prediction | None) -> Encoded:
     """The point of a wish before it is measured."""
-    point = Encoded(name=wish.name, codec=wish.codec, group=wish.group, options=wish.options)
+    assert wish.config is not None
+    point = Encoded(
+        name=wish.name, codec=wish.codec, group=wish.group, options=options_of(wish.config)
+    )
     if prediction is None:
         return point
     return replace(
@@ -260,6 +213,7 @@ def encoded_of(report: Mapping[str, Any], point: Encoded, *, missed: bool) -> En
         max_abs_error=report["max_abs_error"],
         exact=report["rmse"] == 0,
         missed=missed,
+        region_ms=_region_ms(report["path"], report["shape"]),
     )
 
 
@@ -275,6 +229,8 @@ REGION = 16
 """Vertices along each axis of the region."""
 PLACES = 5
 """Random places of which the median is taken; `uses` reads at one more as a warm-up."""
+REGION_SECONDS = 1.0
+"""Seconds after which no further place is read for a median."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -435,7 +391,7 @@ def _price(part: Series, config: EncodeConfig, counted: float | None) -> ModelPr
             profile=config.profile,
             bytes=round(report["bytes"] + growing * (1 / share - 1)),
             seconds=report["seconds"] / share,
-            region_ms=1000 * median(_region_seconds(report["path"], part.shape)),
+            region_ms=_region_ms(report["path"], part.shape),
             picture_ms=1000 * picture.seconds,
             psnr=report["psnr"],
             between=_between(part, config, Path(folder) / "half.fhz"),
@@ -443,16 +399,18 @@ def _price(part: Series, config: EncodeConfig, counted: float | None) -> ModelPr
         )
 
 
-def _region_seconds(path: str, shape: Shape) -> Iterator[float]:
-    """Seconds of regions at random places, each of a file that is opened for it."""
+def _region_ms(path: str, shape: Sequence[int]) -> float:
+    """Median milliseconds of regions at random places, each of a file that is opened for it."""
     random = np.random.default_rng(0)
-    for _ in range(PLACES):
+    taken: list[float] = []
+    while len(taken) < PLACES and sum(taken) < REGION_SECONDS:
         low = [int(random.integers(0, max(n - REGION, 0) + 1)) for n in shape[1:]]
         region = Box.of((a, min(a + REGION, n)) for a, n in zip(low, shape[1:], strict=True))
         step, begun = int(random.integers(0, shape[0])), time.perf_counter()
         with open_volume(path) as volume:
             volume.read(step, region)
-        yield time.perf_counter() - begun
+        taken.append(time.perf_counter() - begun)
+    return 1000 * median(taken)
 
 
 def _between(part: Series, config: EncodeConfig, path: Path) -> float | None:

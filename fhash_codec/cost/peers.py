@@ -519,7 +519,7 @@ class PeerEncodings:
             decoded, count = read_all(file, variant, self._values.shape), stored_bytes(file)
         errors = facts.errors()
         for step, frame in enumerate(decoded):
-            errors.add(step, self._series.read(step), frame)
+            errors.add(step, self._series.read(step), frame, facts.mask(step))
         self._seconds[variant.peer] = time.perf_counter() - begun
         trial = trial_of(errors, level, count)
         bulk = errors.bulk_quality()

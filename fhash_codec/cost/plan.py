@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,8 +16,9 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.results import LeftOut
-from fhash_codec.features.scan import scan
+from fhash_codec.cost.results import DEFAULT, NETWORK, LeftOut
+from fhash_codec.features.features import Extent
+from fhash_codec.features.selection import select_features
 from fhash_codec.measure.errors import Errors, find_bulk
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_codec.progress import Progress
@@ -57,9 +60,9 @@ class Allowance:
         """Seconds until the end of the present part, 0 at least."""
         return max(self._end - self.spent, 0.0)
 
-    def part(self, end: float) -> None:
-        """Begin a part that ends at a share of all seconds, 0 to 1."""
-        self._end = end * self.seconds
+    def part(self, share: float) -> None:
+        """Begin a part that may take a share, 0 to 1, of all seconds that are left."""
+        self._end = self.spent + share * max(self.seconds - self.spent, 0.0)
 
     def has(self, what: str, seconds: float, *, share: float = 1.0) -> bool:
         """Whether work of some seconds fits in a share of what is left of the part.
@@ -115,14 +118,17 @@ class Facts:
     """Figures of a series.
 
     Attributes:
-        value_range, bulk: in data units; bulk is None where the middle 98 % have no width.
+        value_range, bulk: in data units; bulk is of the coreset; None where its middle 98 %
+            have no width.
         missing: number of values that are not finite.
+        coreset: the vertices whose errors count; None for all.
     """
 
     value_range: ValueRange
     bulk: ValueRange | None
     missing: int
     raw_bytes: int
+    coreset: Extent | None = None
 
     @property
     def width(self) -> float:
@@ -134,28 +140,43 @@ class Facts:
         """Power of two that brings differences of values near 1."""
         return power_of_two(self.width)
 
-    @property
-    def scaled_width(self) -> float:
-        """Width of the range after scaling."""
-        return self.width * self.scale
-
     def errors(self) -> Errors:
         """Errors without a frame yet."""
         return Errors(self.width, self.bulk)
 
+    def mask(self, step: int) -> npt.NDArray[np.bool_] | None:
+        """Mask (z, y, x) of the vertices whose errors count at a step; None for all."""
+        if self.coreset is None:
+            return None
+        mask = np.zeros(self.coreset.domain, dtype=np.bool_)
+        mask[self.coreset.box.slices()] = self.coreset.mask(step)
+        return mask
 
-def facts_of(series: Series, progress: Progress) -> Facts:
-    """Scan a series; raises InputError for one without a finite value."""
-    scanned = scan(series, progress)
-    value_range = scanned.value_range
-    bulk = find_bulk(lambda: series.frames(), value_range, whole=series.dtype.kind in "iu")
+
+EVERYTHING = ("all",)
+"""Features of a series that is encoded in whole."""
+
+
+def facts_of(series: Series, progress: Progress, features: tuple[str, ...] = EVERYTHING) -> Facts:
+    """Scan a series; raises InputError for one without a finite value or vertex of the features."""
+    selected = select_features(series, EncodeConfig(features=features), progress)
+    scanned, value_range = selected.scanned, selected.scanned.value_range
     count = prod(series.shape)
-    return Facts(
+    facts = Facts(
         value_range=value_range,
-        bulk=bulk,
+        bulk=None,
         missing=count - scanned.finite_count,
         raw_bytes=count * series.dtype.itemsize,
+        coreset=None if "all" in features else selected.extent,
     )
+
+    def counted_values() -> Iterator[npt.NDArray[Any]]:
+        for step, frame in enumerate(series.frames()):
+            mask = facts.mask(step)
+            yield frame if mask is None else frame[mask]
+
+    bulk = find_bulk(counted_values, value_range, whole=series.dtype.kind in "iu")
+    return replace(facts, bulk=bulk)
 
 
 MIN_STEPS = 8
@@ -234,8 +255,6 @@ def described(series: Series) -> str:
 
 PEERS = ("SZ3", "SPERR", "ZFP")
 """Peers that are measured where their package is there."""
-EPOCHS = (2, 3, 5, 10, 20, 50)
-"""Epochs of the profile paper, of which the largest number that fits is trained after a first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +264,7 @@ class Wish:
     Attributes:
         codec: "compact", "paper" or a peer.
         group: the curve that it belongs to.
-        config: settings; None for a peer, and for "paper", whose epochs follow from the time.
+        config: settings; None for a peer.
         target: PSNR in dB that a peer is set to.
     """
 
@@ -255,88 +274,66 @@ class Wish:
     target: float = 0.0
 
     @property
-    def options(self) -> str:
-        """Options of `fhash encode` that give the encoding; empty for a peer and the defaults."""
-        if self.config is None:
-            return ""
-        default = EncodeConfig()
-        return " ".join(
-            f"--{name.replace('_', '-')} {value:g}"
-            if isinstance(value, float)
-            else f"--{name.replace('_', '-')} {value}"
-            for name, value in vars(self.config).items()
-            if value != getattr(default, name)
-        )
-
-    @property
     def name(self) -> str:
         """The encoding in words."""
         if self.config is None:
-            return f"{self.codec}, {self.target:g} dB" if self.target else self.codec
-        if self.codec == "paper":
-            count = self.config.epochs
-            return f"paper, {count} epoch" + ("s" if count > 1 else "")
-        promise = next(
-            (
-                text
-                for value, text in (
-                    (self.config.psnr, f"{self.config.psnr or 0:g} dB"),
-                    (
-                        self.config.max_error_rel,
-                        f"error within {100 * (self.config.max_error_rel or 0):g} %",
-                    ),
-                )
-                if value is not None
-            ),
-            "the default promise",
-        )
-        return f"{self.group}, {promise}"
+            return f"{self.codec}, {self.target:g} dB"
+        if self.config.max_error_rel is not None:
+            return f"{self.group}, error within {100 * self.config.max_error_rel:g} %"
+        if self.config.psnr is not None:
+            return f"{self.group}, {self.config.psnr:g} dB"
+        return NETWORK if self.codec == "paper" else DEFAULT
+
+    @property
+    def always(self) -> bool:
+        """Whether it is measured whatever the time: the default settings and the network."""
+        return self.name in (DEFAULT, NETWORK)
 
 
-def wishes() -> Iterator[Wish]:
-    """Every encoding, in the order in which they are measured."""
-    yield _psnr(1, 50)
-    yield from _peers(50)
-    yield _psnr(3, 50)
-    yield Wish(codec="compact", group="compact, effort 5", config=EncodeConfig())
-    yield Wish(codec="paper", group="paper")
-    # Peers take several times the time that is shown for them, since each is led to its target.
+def options_of(config: EncodeConfig) -> str:
+    """Options of `fhash encode` that give settings, for a shell; empty for the defaults."""
+    words = []
+    for field in dataclasses.fields(config):
+        name, value = EncodeConfig.label(field), getattr(config, field.name)
+        if value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{'' if value else 'no-'}{name}")
+            continue
+        for each in value if isinstance(value, tuple) else (value,):
+            text = f"{each:.12g}" if isinstance(each, float) else f"{each}"
+            # The name that the options of the command line are listed with.
+            text = "network" if name == "profile" else text
+            words += [f"--{name}", shlex.quote(text)]
+    return " ".join(words)
+
+
+def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
+    """Every encoding, in the order in which they are measured: those first that always are."""
+
+    def own(effort: int, psnr: float | None = None, error: float | None = None) -> Wish:
+        config = EncodeConfig(features=features, effort=effort, psnr=psnr, max_error_rel=error)
+        return Wish(codec="compact", group=f"effort {effort}", config=config)
+
+    def peers(target: float) -> Iterator[Wish]:
+        for name in PEERS:
+            yield Wish(codec=name, group=name, target=target)
+
+    yield own(5)
+    network = EncodeConfig(profile="paper", features=features)
+    yield Wish(codec="paper", group=NETWORK, config=network)
+    yield own(1, psnr=50.0)
+    # A peer takes several times the time that is shown for it, since it is led to its target.
+    yield from peers(50.0)
+    # The rows of the advice: the fastest and the default of each, and then what may be smaller.
+    for efforts, targets in (((1, 5), (40.0, 60.0, 45.0)), ((3,), (50.0, 40.0, 60.0, 45.0))):
+        for target in targets:
+            yield from (own(effort, psnr=target) for effort in efforts)
+        for share in (0.01, 0.001):
+            yield from (own(effort, error=share) for effort in efforts)
+    for target in (40.0, 60.0, 45.0, 70.0):
+        yield from peers(target)
     for effort in (1, 3):
-        for target in (40, 60):
-            yield _psnr(effort, target)
-    for target in (40, 60):
-        yield from _peers(target)
-    for target in (45, 70):
-        yield _psnr(1, target)
-        yield from _peers(target)
-        yield _psnr(3, target)
-    for target in (40, 60):
-        yield _psnr(5, target)
-    for share in (0.01, 0.001):
-        yield Wish(
-            codec="compact",
-            group="compact, effort 3",
-            config=EncodeConfig(effort=3, max_error_rel=share),
-        )
-    yield _psnr(2, 50)
-    yield _psnr(5, 45)
-    yield _psnr(7, 50)
-    yield _psnr(9, 50)
-
-
-def paper_config(epochs: int) -> EncodeConfig:
-    """Settings of the published model, trained for some epochs."""
-    return EncodeConfig(profile="paper", epochs=epochs)
-
-
-def _psnr(effort: int, target: float) -> Wish:
-    return Wish(
-        codec="compact",
-        group=f"compact, effort {effort}",
-        config=EncodeConfig(effort=effort, psnr=float(target)),
-    )
-
-
-def _peers(target: float) -> Iterator[Wish]:
-    for name in PEERS:
-        yield Wish(codec=name, group=name, target=float(target))
+        yield own(effort, psnr=70.0)
+    for effort in (2, 7, 9):
+        yield own(effort, psnr=50.0)

@@ -17,7 +17,6 @@ import numpy as np
 from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
 from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.head import (
-    EFFORTS,
     MIN_GAIN,
     NEAR_GAIN,
     TRAINING_VERTICES,
@@ -348,8 +347,6 @@ def _measuring(work: _Work, head: HeadProbe | None) -> float:
         + rates.ssim * measured * plane
     )
 
-
-assert MIN_HEAD_EFFORT in EFFORTS
 
 LOOKED_AT = 32 << 20
 """Vertices of a series up to which all of it is looked at."""

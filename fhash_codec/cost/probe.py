@@ -439,7 +439,7 @@ ONCE = ("opening", "engine", "other")
 
 @dataclass(frozen=True, kw_only=True)
 class PaperProbe:
-    """An encoding of two epochs, of a series or a part of it.
+    """An encoding of two epochs.
 
     Attributes:
         stages: seconds of each stage but the training, for the whole series.
@@ -468,45 +468,54 @@ class PaperProbe:
             "curve": points * self.curve,
         }
 
+    def of_share(self, share: float, batch: int = 0) -> PaperProbe:
+        """The probe of a share of the series, or above 1 of a larger one.
+
+        batch: as in EncodeConfig.
+        """
+        samples, bricks = (max(1, round(count * share)) for count in (self.samples, self.bricks))
+        before, after = (
+            usual_batches(*counts, batch)
+            for counts in ((self.samples, self.bricks), (samples, bricks))
+        )
+        return replace(
+            self,
+            stages={
+                name: seconds if name in ONCE else seconds * share
+                for name, seconds in self.stages.items()
+            },
+            # A step takes as long as it has samples.
+            step=self.step * (samples / after) / (self.samples / before),
+            samples=samples,
+            bricks=bricks,
+            bytes=round(self.bytes * share),
+        )
+
 
 def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
-    """Encode a part of a series for two epochs, with batches of the size for the whole.
+    """Encode a part of a series for two epochs, with batches of its size; the probe of the whole.
 
     share: share of the series that the part is.
     """
-    report = _encoded(part, replace(config, epochs=EPOCHS, psnr=None, psnr_bulk=None, timings=True))
+    config = replace(config, epochs=EPOCHS, psnr=None, psnr_bulk=None, timings=True)
+    with TemporaryDirectory() as folder:
+        report, _ = reported(part, Path(folder) / "part.fhz", config)
     stages = {entry["stage"]: entry["seconds"] for entry in report["stages"]}
     training, curve = stages.pop("training", 0.0), stages.pop("curve", 0.0)
-    vertices = prod(hi - lo for lo, hi in report["feature_bounding_box"]) * len(
-        report["key_frames"]
-    )
-    domain = prod(part.shape[1:]) * len(report["key_frames"])
-    samples = max(1, round(report["coreset_fraction"] * domain / share))
+    keys = len(report["key_frames"])
+    vertices = prod(hi - lo for lo, hi in report["feature_bounding_box"]) * keys
+    samples = max(1, round(report["coreset_fraction"] * prod(part.shape[1:]) * keys))
+    bricks = max(1, vertices >> sum(BRICK_BITS))
     first, last = (point["seconds"] or 0.0 for point in (report["curve"][0], report["curve"][-1]))
-    bricks = max(1, round(vertices / share) >> sum(BRICK_BITS))
-    batches_here = usual_batches(
-        round(samples * share), max(1, round(bricks * share)), config.batch
-    )
-    batches = usual_batches(samples, bricks, config.batch)
     second = min(max(last - first - curve / EPOCHS, 0.0), training)
-    # A step takes as long as it has samples.
-    larger = (samples / batches) / (samples * share / batches_here)
     return PaperProbe(
-        stages={
-            name: seconds if name in ONCE else seconds / share for name, seconds in stages.items()
-        },
-        step=second / batches_here * larger,
+        stages=stages,
+        step=second / usual_batches(samples, bricks, config.batch),
         curve=curve / EPOCHS,
         samples=samples,
         bricks=bricks,
-        bytes=round(report["bytes"] / share),
-    )
-
-
-def _encoded(part: Series, config: EncodeConfig) -> EncodeReport:
-    """The report of an encoding into a file that is thrown away."""
-    with TemporaryDirectory() as folder:
-        return reported(part, Path(folder) / "part.fhz", config)[0]
+        bytes=report["bytes"],
+    ).of_share(1 / share, config.batch)
 
 
 def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[EncodeReport, bool]:

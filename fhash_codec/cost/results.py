@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,6 +13,10 @@ from fhash_codec.measure.errors import StepErrors
 
 OWN = ("compact", "paper")
 """Codecs of this package; the others are peers."""
+DEFAULT = "default settings"
+"""Name of the encoding that `fhash encode` makes without options."""
+NETWORK = "network"
+"""Name of the encoding with `--profile network` alone, and of its curve."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,9 +24,9 @@ class Encoded:
     """One encoding: what was predicted, and what was measured.
 
     Attributes:
-        name: the encoding in words, such as "compact, effort 5, 50 dB".
+        name: the encoding in words, such as "effort 5, 60 dB".
         codec: "compact", "paper" or the name of a peer.
-        group: the curve that the point belongs to, such as "compact, effort 5".
+        group: the curve that the point belongs to, such as "effort 5".
         options: options of `fhash encode` that give it again; empty for a peer.
         seconds: of the whole encoding; None where it was predicted only.
         bytes: of the file; for a peer of its stored chunks.
@@ -30,6 +36,7 @@ class Encoded:
         max_abs_error: largest error, in data units.
         exact: whether nothing differs.
         missed: whether the file misses its promise.
+        region_ms: milliseconds in which the file is opened and a region of 16^3 is read.
         predicted_seconds, predicted_bytes, predicted_psnr: what was foretold; None where it was
             not.
         basis: what the prediction rests on, in words; empty without one.
@@ -47,6 +54,7 @@ class Encoded:
     max_abs_error: float | None = None
     exact: bool = False
     missed: bool = False
+    region_ms: float | None = None
     predicted_seconds: float | None = None
     predicted_bytes: int | None = None
     predicted_psnr: float | None = None
@@ -158,20 +166,30 @@ class Advice:
     """The best of what was measured for an accuracy.
 
     Attributes:
-        psnr: accuracy asked for, in dB.
-        aim: "smallest" or "fastest" of this package, or "smallest peer".
+        psnr: accuracy asked for, in dB; None where `max_error_rel` is.
+        max_error_rel: largest error asked for, as a fraction of the range; None where `psnr` is.
+        aim: "fastest", "smallest" or "default".
         name: the encoding.
-        options: options of `fhash encode` that give it; empty for a peer.
-        seconds, bytes, reached: its figures, reached in dB; None where exact.
+        options: options of `fhash encode` that give it.
+        seconds, bytes, region_ms, reached: its figures, reached in dB; None where exact.
     """
 
-    psnr: float
+    psnr: float | None = None
+    max_error_rel: float | None = None
     aim: str
     name: str
     options: str
     seconds: float
     bytes: int
+    region_ms: float | None
     reached: float | None
+
+    @property
+    def goal(self) -> str:
+        """The accuracy in words."""
+        if self.max_error_rel is None:
+            return f"{self.psnr:g} dB"
+        return f"within {100 * self.max_error_rel:g} %"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,6 +212,7 @@ class CostReport:
     Attributes:
         series: source and variable. shape: (t, z, y, x) of the whole series.
         units: of the values; may be empty. dtype: number type.
+        features: of all encodings, as `fhash encode` takes them.
         measured: the part that was measured, in words. measured_shape: its shape.
         raw_bytes: of the measured part.
         value_range: smallest and largest value of it.
@@ -209,6 +228,7 @@ class CostReport:
     units: str
     dtype: str
     shape: tuple[int, ...]
+    features: tuple[str, ...] = ("all",)
     measured: str
     measured_shape: tuple[int, ...]
     raw_bytes: int
@@ -233,85 +253,169 @@ class CostReport:
         return {**asdict(self), "encodings": [entry.to_dict() for entry in self.encodings]}
 
 
-TARGETS = (35.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0)
-"""Accuracies in dB that are asked for."""
+TARGETS = (40.0, 45.0, 50.0, 60.0)
+"""Accuracies in dB that are advised for."""
+ERRORS = (0.01, 0.001)
+"""Largest errors that are advised for, as fractions of the range."""
+CLOSE = 5.0
+"""Excess in dB up to which the fastest is looked for first: times are noisy, and sizes count."""
+AS_SMALL = 1.01
+"""Factor on the fewest bytes within which the fastest encoding is the smallest."""
 UNITS = ("B", "kB", "MB", "GB")
 """Decimal units of sizes."""
 
 
-def advise(points: Sequence[Encoded], targets: Sequence[float] = TARGETS) -> tuple[Advice, ...]:
+def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
     """The best of what was measured for each accuracy, by aim.
 
-    The aims are the smallest and the fastest encoding of this package, and the smallest of the
-    peers. Predictions do not count. An accuracy is left out where no encoding reaches it, or where
-    the same are the best for a higher one.
+    The aims are the fastest and the smallest encoding of this package, and the smallest with the
+    default effort. Predictions do not count, and an accuracy that nothing reaches is left out. For
+    a largest error only encodings count that promise one: others keep it by chance.
 
     Args:
         points: measured encodings, and predicted ones.
-        targets: accuracies in dB over all values.
+        width: of the range of the values, in data units.
     """
-    rows: list[list[Advice]] = []
-    for target in sorted(targets):
+    own = [point for point in points if point.measured and point.codec in OWN]
+    usual = next((point.group for point in own if point.name == DEFAULT), None)
+    found = []
+    goals = [*((psnr, None) for psnr in TARGETS), *((0.0, share) for share in ERRORS)]
+    for psnr, share in goals:
+        bound = math.inf if share is None else share * width * (1 + 1e-9)  # it is rounded itself
         reached = [
             point
-            for point in points
-            if point.measured and (point.exact or (point.psnr or 0.0) >= target)
-        ]
-        own = [point for point in reached if point.codec in OWN]
-        others = [point for point in reached if point.codec not in OWN]
-        row = [
-            _advice(min(chosen, key=key), target, aim)
-            for aim, chosen, key in (
-                ("smallest", own, _size_first),
-                ("fastest", own, _time_first),
-                ("smallest peer", others, _size_first),
+            for point in own
+            if point.exact
+            or (
+                (share is None or "--max-error" in point.options)
+                and (point.psnr or 0.0) >= psnr
+                and (math.inf if point.max_abs_error is None else point.max_abs_error) <= bound
             )
-            if chosen
         ]
-        if rows and [entry.name for entry in rows[-1]] == [entry.name for entry in row]:
-            rows.pop()
-        rows.append(row)
-    return tuple(
-        entry
-        for row in rows
-        for place, entry in enumerate(row)
-        if entry.name not in [before.name for before in row[:place]]
-    )
+        close = [point for point in reached if _excess(point, psnr, bound) < CLOSE]
+        for aim, best in (
+            ("fastest", min(close or reached, key=lambda point: point.seconds or 0, default=None)),
+            ("smallest", smallest(reached)),
+            ("default", smallest([point for point in reached if point.group == usual])),
+        ):
+            if best is not None:
+                names = ("name", "options", "seconds", "bytes", "region_ms")
+                figures: dict[str, Any] = {name: getattr(best, name) for name in names}
+                found.append(
+                    Advice(
+                        psnr=psnr or None,
+                        max_error_rel=share,
+                        aim=aim,
+                        reached=best.psnr,
+                        **figures,
+                    )
+                )
+    return tuple(found)
 
 
-def _size_first(point: Encoded) -> tuple[float, float]:
-    return point.bytes or 0, point.seconds or 0.0
+def _excess(point: Encoded, psnr: float, bound: float) -> float:
+    """Excess in dB of an encoding over the accuracy asked for, a PSNR or else a bound."""
+    if psnr:
+        return math.inf if point.psnr is None else point.psnr - psnr
+    return 20 * math.log10(bound / point.max_abs_error) if point.max_abs_error else math.inf
 
 
-def _time_first(point: Encoded) -> tuple[float, float]:
-    return point.seconds or 0.0, point.bytes or 0
+def smallest(points: Sequence[Encoded]) -> Encoded | None:
+    """The smallest of some measured encodings, the fastest of those of nearly its size."""
+    least = min((point.bytes or 0 for point in points), default=0)
+    able = [point for point in points if (point.bytes or 0) <= AS_SMALL * least]
+    return min(able, key=lambda point: point.seconds or 0.0, default=None)
 
 
-def _advice(best: Encoded, target: float, aim: str) -> Advice:
-    """The advice to take a measured encoding."""
-    return Advice(
-        psnr=target,
-        aim=aim,
-        name=best.name,
-        options=best.options,
-        seconds=best.seconds or 0.0,
-        bytes=best.bytes or 0,
-        reached=best.psnr,
-    )
+ADVICE = ("accuracy", "encoding", "time", "size", "16^3 region", "options")
+"""Header of the table of advice."""
 
 
-def told(advice: Advice) -> str:
-    """A line such as "45 dB: 1.4 s, 99 kB, the smallest: compact, effort 3, 45 dB"."""
-    options = f" ({advice.options})" if advice.options else ""
-    return (
-        f"{advice.psnr:g} dB: {seconds_text(advice.seconds)}, {bytes_text(advice.bytes)},"
-        f" the {advice.aim}: {advice.name}{options}"
-    )
+def advice_rows(report: CostReport) -> list[tuple[str, ...]]:
+    """The table of advice: a row for each accuracy and encoding, with all its aims in one cell.
+
+    The accuracy stands in the first of its rows alone; options leave out the features of all rows.
+    """
+    common = " ".join(feature_options(report))
+    rows: dict[tuple[str, str], list[Advice]] = {}
+    for advice in report.advice:
+        rows.setdefault((advice.goal, advice.name), []).append(advice)
+    cells: list[tuple[str, ...]] = []
+    last = ""
+    for (goal, _), entries in rows.items():
+        one = entries[0]
+        cells.append(
+            (
+                "" if goal == last else goal,
+                ", ".join(entry.aim for entry in entries) if len(entries) < 3 else "all three",
+                seconds_text(one.seconds),
+                bytes_text(one.bytes),
+                "-" if one.region_ms is None else seconds_text(one.region_ms, "ms"),
+                " ".join(one.options.replace(common, "").split()) or "none",
+            )
+        )
+        last = goal
+    return cells
 
 
-def seconds_text(seconds: float) -> str:
-    """Seconds in two digits, such as 0.43 s or 54 s."""
-    return f"{seconds:.2g} s" if seconds < 9.95 else f"{seconds:.0f} s"
+def feature_options(report: CostReport) -> list[str]:
+    """Options that name the features of a report; none where everything is encoded."""
+    if "all" in report.features:
+        return []
+    return [f"--feature {shlex.quote(feature)}" for feature in report.features]
+
+
+def conclusion(report: CostReport) -> str:
+    """One sentence on what was measured; empty where the default settings were not."""
+    points = {point.name: point for point in report.encodings if point.measured}
+    usual, network = points.get(DEFAULT), points.get(NETWORK)
+    if usual is None:
+        return ""
+    data = "the data" if report.measured_shape == report.shape else "this crop of the data"
+    ratio = f"{usual.ratio:,.{0 if (usual.ratio or 0) > 99 else 1}f}"
+    parts = [f"The default settings make {data} {ratio} times smaller: {told(usual)}"]
+    parts += [
+        f"the fastest for 50 dB, {advice.options}: {told(points[advice.name])}"
+        for advice in report.advice
+        if (advice.psnr, advice.aim) == (50.0, "fastest") and advice.name not in (DEFAULT, NETWORK)
+    ]
+    peers = [point for point in points.values() if point.codec not in OWN]
+    peer = smallest([each for each in peers if _excess(each, usual.psnr or math.inf, 0.0) >= 0])
+    if peer is not None:
+        parts.append(f"the smallest peer, {peer.codec}: {told(peer)}")
+    if network is not None:
+        parts.append(f"the network: {told(network)}")
+    return "; ".join(parts) + "."
+
+
+def told(point: Encoded) -> str:
+    """Size, time and quality of an encoding."""
+    quality = ", exact" if point.exact else "" if point.psnr is None else f", {point.psnr:.1f} dB"
+    return f"{bytes_text(point.bytes or 0)}, {seconds_text(point.seconds or 0.0)}{quality}"
+
+
+NEAR = 1.25
+"""Factor between what was predicted and what was measured up to which predictions are drawn."""
+
+
+def trusted(points: Sequence[Encoded]) -> set[str]:
+    """The groups whose predictions are worth drawing.
+
+    In this run seconds and bytes of each encoding of such a group that was predicted and measured,
+    at least two, lay within NEAR of its prediction.
+    """
+    worst: dict[str, list[float]] = {}
+    for point in points:
+        if point.measured and point.predicted_seconds is not None:
+            pairs = (point.seconds, point.predicted_seconds), (point.bytes, point.predicted_bytes)
+            ratios = [a / b if a and b else math.inf for a, b in pairs]
+            worst.setdefault(point.group, []).append(max(max(ratio, 1 / ratio) for ratio in ratios))
+    return {group for group, each in worst.items() if len(each) >= 2 and max(each) <= NEAR}
+
+
+def seconds_text(seconds: float, unit: str = "s") -> str:
+    """Seconds, or another unit of time, in two digits or whole, such as 0.43 s or 154 s."""
+    return f"{seconds:.2g} {unit}" if seconds < 9.95 else f"{seconds:.0f} {unit}"
 
 
 def bytes_text(count: float) -> str:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.cost.encodings import PLACES, REGION, KeptFile
 from fhash_codec.cost.plan import Allowance, Facts
-from fhash_codec.cost.results import Picture, Read
+from fhash_codec.cost.results import NETWORK, Picture, Read
 from fhash_codec.measure.errors import psnr
 from fhash_codec.measure.metrics import ssim
 from fhash_codec.progress import Progress
@@ -199,7 +199,7 @@ def _measured(series: Series, file: KeptFile, kind: _Kind, facts: Facts) -> Read
         values=values.size,
         milliseconds=1e3 * median(taken),
         bytes_read=round(median(touched)),
-        psnr=psnr(facts.scaled_width, rmse),
+        psnr=psnr(facts.width * facts.scale, rmse),
         max_abs_error=largest / facts.scale if count else None,
     )
 
@@ -290,7 +290,7 @@ class PictureCosts:
         self._knob("threshold", "threshold", THRESHOLDS)
         self._first_pictures()
         for file in files:
-            if not self._allowance.interrupted and file.name.startswith("paper"):
+            if not self._allowance.interrupted and file.name == NETWORK:
                 with open_volume(file.path) as volume:
                     self._marches(Renderer(volume), NETWORK_SIZE)
 
@@ -408,7 +408,7 @@ class PictureCosts:
             return
         plan = self._renderer.plan(self._scene)
         with self._allowance.work(f"pictures by {group}"):
-            reference = _marched(source_frame(series, plan), plan)
+            reference = _marched(self._source_frame(series, plan), plan)
             for file in files:
                 with open_volume(file.path) as volume:
                     begun = time.perf_counter()
@@ -420,12 +420,12 @@ class PictureCosts:
                 self._add(group, file.name, 1e3 * seconds, image, reference.rgba)
             self._add(group, "the source", 0.0, reference, None, best=True)
 
-
-def source_frame(series: Series, plan: Plan) -> Frame:
-    """The frame of the source that a plan decodes from a file, in the units of its march."""
-    values = series.read(int(plan.step))[plan.region.slices()]
-    z, y, x = (low for low, _ in plan.region)
-    return Frame(values=plan.units.single(values), first=(z, y, x))
+    def _source_frame(self, series: Series, plan: Plan) -> Frame:
+        """The frame of the source that a plan decodes from a file, in the units of its march."""
+        values = plan.units.single(series.read(int(plan.step))[plan.region.slices()])
+        kept = self._volume.occupancy(plan.step, plan.region)
+        z, y, x = (low for low, _ in plan.region)
+        return Frame(values=np.where(kept, values, np.float32(np.nan)), first=(z, y, x))
 
 
 def _marched(frame: Frame, plan: Plan) -> Image:

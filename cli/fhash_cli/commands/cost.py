@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import click
 
@@ -15,6 +16,7 @@ from fhash_cli.options import (
     json_option,
     quiet_option,
     series_options,
+    setting_options,
 )
 from fhash_cli.output import Progress, duration, emit, extent, table
 from fhash_formats.errors import InputError, InterruptedEncodingError, OutputError
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     help="Folder of the report: cost.html, cost.png and cost.json.  [default: DATA.cost here]",
 )
 @series_options
+@setting_options("features")
 @click.option(
     "--budget",
     type=DURATION,
@@ -47,6 +50,7 @@ def command(
     data: str,
     output: str | None,
     source: SourceOptions,
+    settings: dict[str, Any],
     budget: float,
     force: bool,
     as_json: bool,
@@ -54,8 +58,9 @@ def command(
 ) -> None:
     """Measure what accuracy costs on DATA: seconds and bytes of encoding, reading and drawing.
 
-    The most telling measurements come first, until the budget is spent; the report says what was
-    left out. Ctrl-C ends the measurements, and the report of what there is by then is written.
+    The default settings and the network are always measured, of a crop where DATA is large. The
+    most telling of the others follow until the budget is spent; the report says what was left out.
+    Ctrl-C ends the measurements, and the report of what there is by then is written.
     SZ3, SPERR and ZFP come with pip install 'fhash[bench]', as does what the page needs.
     """
     folder = Path(output) if output is not None else Path(Path(data).stem + ".cost")
@@ -64,7 +69,8 @@ def command(
         from fhash_codec.cost.cost import measure_cost
         from fhash_codec.cost.report import write_report
 
-        report = measure_cost(series, budget=budget, progress=progress)
+        features = settings["features"]
+        report = measure_cost(series, features=features, budget=budget, progress=progress)
         paths = write_report(report, folder, force=force)
     stopped = None
     if report.interrupted:
@@ -92,13 +98,16 @@ def check_report_folder(folder: Path, force: bool, data: str) -> None:
 
 
 def report_text(report: CostReport, paths: list[Path]) -> str:
-    """The recommendation, what was left out, and where the report is."""
-    from fhash_codec.cost.results import told
+    """The conclusion, the table of advice, what was left out, and where the report is."""
+    from fhash_codec.cost.results import ADVICE, advice_rows, conclusion, feature_options
 
-    lines = [told(entry) for entry in report.advice]
-    late = [entry.what for entry in report.left_out if entry.late]
+    lines = [*textwrap.wrap(conclusion(report), 100), ""]
+    if report.advice:
+        lines += table([ADVICE, *advice_rows(report)], left=True).splitlines()
+        lines += [f"each with {option}" for option in feature_options(report)]
+    late = sum(entry.late for entry in report.left_out)
     if late:
-        lines += ["", f"no time was left for: {'; '.join(late)}"]
+        lines += ["", f"no time was left for {late} measurements; the page lists them as left out"]
     lines += [f"left out: {entry.what}: {entry.why}" for entry in report.left_out if not entry.late]
     facts = [
         ("measured", f"{report.measured}, {extent(report.measured_shape)}"),

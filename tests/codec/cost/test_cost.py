@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from fhash_codec.cost.cost import measure_cost, report_on_encode
 from fhash_codec.cost.encodings import KeptFile
 from fhash_codec.cost.plan import Allowance, Wish, facts_of
 from fhash_codec.cost.prediction import Prediction
-from fhash_codec.cost.results import Picture
+from fhash_codec.cost.results import Picture, advice_rows, feature_options
 from fhash_codec.cost.uses import (
     NOTHING,
     PictureCosts,
@@ -33,11 +34,11 @@ from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 
 
-def few() -> Iterator[Wish]:
+def few(features: tuple[str, ...]) -> Iterator[Wish]:
     """Two encodings and a peer."""
     for effort in (1, 2):
-        config = EncodeConfig(effort=effort, psnr=40.0)
-        yield Wish(codec="compact", group=f"compact, effort {effort}", config=config)
+        config = EncodeConfig(effort=effort, psnr=40.0, features=features)
+        yield Wish(codec="compact", group=f"effort {effort}", config=config)
     yield Wish(codec="SZ3", group="SZ3", target=40.0)
 
 
@@ -55,8 +56,13 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
             return Prediction(seconds=self.seconds, bytes=9, psnr=40.0, basis="")
 
     monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(Foretold(series)))
+    training = SimpleNamespace(
+        of_share=lambda kept: training, stage_seconds=lambda config: {"a": 0.0}
+    )
+    monkeypatch.setattr(cost, "probe_paper", lambda *_: training)
     monkeypatch.setattr(cost, "wishes", few)
-    monkeypatch.setattr(pictures.PictureCosts, "measure", lambda self, series, files: None)
+    drawn = SimpleNamespace(measure=lambda series, files: None)
+    monkeypatch.setattr(cost, "PictureCosts", lambda *_: drawn)
 
 
 def test_encodings_reads_and_advice(series: ArraySeries) -> None:
@@ -66,7 +72,7 @@ def test_encodings_reads_and_advice(series: ArraySeries) -> None:
     assert {read.what for read in report.reads} >= {"open", "frame", "line in time"}
     assert report.measured == "the whole series"
     assert report.raw_bytes == series.values.nbytes
-    assert {entry.aim for entry in report.advice} >= {"smallest"}
+    assert {entry.goal for entry in report.advice} >= {"40 dB"}
     assert not report.interrupted
     assert report.left_out == ()
 
@@ -74,12 +80,27 @@ def test_encodings_reads_and_advice(series: ArraySeries) -> None:
 def test_a_series_that_is_too_large_is_cropped(
     series: ArraySeries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cost, "FAST_SHARE", 0.5e-9 * series.values.size / 500.0)
+    monkeypatch.setattr(cost, "ADVICE_SHARE", 3e-9 * series.values.size / 500.0)
+    monkeypatch.setattr(cost, "MIN_VERTICES", 1)
     report = measure_cost(series, budget=500.0)
     assert report.measured.startswith("a crop, ")
     assert report.shape == series.shape
     assert np.prod(report.measured_shape) < 0.7 * np.prod(report.shape)
     assert report.raw_bytes == 4 * np.prod(report.measured_shape)
+
+
+def test_features_are_those_of_every_encoding(series: ArraySeries) -> None:
+    report = measure_cost(series, features=("interval:1:9",), budget=500.0)
+    assert report.features == ("interval:1:9",)
+    own = [point for point in report.encodings if point.codec == "compact"]
+    assert all("--feature interval:1:9" in point.options for point in own)
+    assert feature_options(report) == ["--feature interval:1:9"]
+    assert {row[-1] for row in advice_rows(report)} <= {
+        "--psnr 40 --effort 1",
+        "--psnr 40 --effort 2",
+    }
+    with pytest.raises(InputError, match="interval:99:100"):
+        measure_cost(series, features=("interval:99:100",), budget=500.0)
 
 
 def test_ctrl_c_keeps_what_was_measured(
@@ -114,10 +135,7 @@ def test_unsuitable_budgets_and_series_are_refused(series: ArraySeries) -> None:
         measure_cost(np.ones((2, 3, 4, 5)), budget=10.0)
 
 
-def test_stages_steps_reads_and_the_file_itself(
-    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pictures.PictureCosts, "measure", lambda self, series, files: None)
+def test_stages_steps_reads_and_the_file_itself(series: ArraySeries, tmp_path: Path) -> None:
     config = EncodeConfig(effort=2, psnr=45.0)
     path = tmp_path / "run.fhz"
     figures = encode(series, path, config)
@@ -158,9 +176,9 @@ def test_every_group_is_measured(series: ArraySeries, tmp_path: Path) -> None:
         path = tmp_path / f"{name}.fhz"
         encode(series, path, EncodeConfig(effort=1, psnr=psnr))
         files.append(KeptFile(name=name, path=path, psnr=psnr))
-    network = tmp_path / "paper.fhz"
+    network = tmp_path / "network.fhz"
     encode(series, network, EncodeConfig(profile="paper", epochs=1, width=4))
-    files.append(KeptFile(name="paper", path=network, psnr=20.0))
+    files.append(KeptFile(name="network", path=network, psnr=20.0))
     made: list[Picture] = []
     allowance = Allowance(1000.0)
     with open_volume(files[0].path) as volume:
@@ -190,6 +208,21 @@ def test_every_group_is_measured(series: ArraySeries, tmp_path: Path) -> None:
     assert {"level of detail", "threshold", "level of detail, first picture"} <= {
         each.group for each in made
     }
+
+
+@pytest.mark.usefixtures("small")
+def test_a_picture_of_a_feature_is_compared_with_that_feature(
+    series: ArraySeries, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.fhz"
+    encode(series, path, EncodeConfig(effort=1, max_error=0.0, features=("onset:0.5",)))
+    made: list[Picture] = []
+    with open_volume(path) as volume:
+        assert not volume.occupancy(2).all()
+        files = [KeptFile(name="exact", path=path, psnr=None)]
+        PictureCosts(volume, Allowance(1000.0), silent, made).measure(series, files)
+    (picture,) = [each for each in made if (each.group, each.setting) == ("encoding", "exact")]
+    assert (picture.psnr, picture.ssim) == (None, pytest.approx(1.0))
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ from fhash_codec.cost.plan import (
     cropped,
     described,
     facts_of,
-    paper_config,
+    options_of,
     wishes,
 )
 from fhash_codec.cost.prediction import (
@@ -47,8 +47,19 @@ from fhash_codec.cost.prediction import (
     choose,
 )
 from fhash_codec.cost.probe import PaperProbe, look_at, probe_rates, updates_of
-from fhash_codec.cost.results import CostReport, Encoded, advise, bytes_text, told
+from fhash_codec.cost.results import (
+    DEFAULT,
+    NETWORK,
+    CostReport,
+    Encoded,
+    advise,
+    bytes_text,
+    seconds_text,
+)
+from fhash_codec.encoding import encode
+from fhash_codec.paper.train import usual_batches
 from fhash_codec.progress import silent
+from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InterruptedEncodingError, RegionError
 from fhash_formats.series import ArraySeries, Series, StepsSeries
 from fhash_formats.support.threads import thread_pool
@@ -102,6 +113,17 @@ def test_a_batch_of_another_size_makes_other_steps() -> None:
     pytest.importorskip("torch")
     config = EncodeConfig(profile="paper", epochs=10, batch=10_000)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * 100 + 0.25 * 10
+
+
+def test_a_share_of_a_series_has_its_samples_and_steps_of_their_size() -> None:
+    pytest.importorskip("torch")
+    half = PROBE.of_share(0.5)
+    assert (half.samples, half.bricks, half.bytes) == (50_000, 500, 500)
+    assert half.stages["scan"] == 0.5
+    before, after = (usual_batches(each.samples, each.bricks) for each in (PROBE, half))
+    per_sample = [each.step * n / each.samples for each, n in ((PROBE, before), (half, after))]
+    assert per_sample[0] == pytest.approx(per_sample[1])
+    assert PROBE.of_share(1.0) == PROBE
 
 
 @pytest.mark.parametrize("shape", [(4, 8, 24, 24), (1, 1, 40, 40), (3, 1, 1, 30), (2, 150, 8, 8)])
@@ -314,6 +336,8 @@ def test_a_part_ends_at_its_share_and_what_does_not_fit_is_told() -> None:
     assert not allowance.has("half", 16.0, share=0.5)
     clock.now = 70.0
     assert allowance.left == 0.0
+    allowance.part(0.5)
+    assert allowance.left == 15.0
     entry, _ = allowance.left_out
     assert (entry.what, entry.late) == ("long", True)
     assert "31 s" in entry.why
@@ -393,23 +417,47 @@ def test_a_constant_series_has_no_width() -> None:
     assert (facts.width, facts.bulk) == (0.0, None)
 
 
-def test_the_default_and_the_peers_come_early_and_every_name_once() -> None:
+def test_errors_count_in_the_features_alone(series: ArraySeries, tmp_path: Path) -> None:
+    features = ("interval:1:9",)
+    facts = facts_of(series, silent, features)
+    report = encode(series, tmp_path / "a.fhz", EncodeConfig(effort=1, features=features))
+    with open_volume(report["path"]) as volume:
+        for step in range(len(series.values)):
+            np.testing.assert_array_equal(facts.mask(step), volume.occupancy(step))
+        assert facts.bulk is not None
+        assert [facts.bulk.low, facts.bulk.high] == report["quality"]["bulk"]["range"]
+    peers = PeerEncodings(series, facts, tmp_path, Allowance(1000.0), silent)
+    peers.measure(wish("SPERR", 40.0))
+    (point,) = peers.points
+    assert point.psnr is not None
+    everything = encodings(series, tmp_path, Allowance(1000.0))
+    everything.measure(wish("SPERR", 40.0))
+    assert point.psnr != everything.points[0].psnr
+
+
+def test_the_default_and_the_network_come_first_and_every_name_once() -> None:
     every = list(wishes())
-    assert EncodeConfig() in [wish.config for wish in every[:6]]
-    assert [wish.codec for wish in every[1:4]] == list(PEERS)
+    assert [wish.config for wish in every[:2]] == [EncodeConfig(), EncodeConfig(profile="paper")]
+    assert [wish.always for wish in every] == [True, True, *[False] * (len(every) - 2)]
+    assert [wish.codec for wish in every[3:6]] == list(PEERS)
     names = [wish.name for wish in every]
     assert len(names) == len(set(names))
-    assert {wish.codec for wish in every} == {"compact", "paper", *PEERS}
 
 
 def test_options_give_the_encoding_again() -> None:
     config = EncodeConfig(effort=3, psnr=45.0)
-    wish = Wish(codec="compact", group="compact, effort 3", config=config)
-    assert wish.options == "--psnr 45 --effort 3"
-    assert wish.name == "compact, effort 3, 45 dB"
-    assert Wish(codec="compact", group="g", config=EncodeConfig()).options == ""
-    paper = Wish(codec="paper", group="paper", config=paper_config(1))
-    assert (paper.name, paper.options) == ("paper, 1 epoch", "--profile paper --epochs 1")
+    wish = Wish(codec="compact", group="effort 3", config=config)
+    assert options_of(config) == "--psnr 45 --effort 3"
+    assert wish.name == "effort 3, 45 dB"
+    assert options_of(EncodeConfig()) == ""
+    (_, network, *_) = wishes(("mask:a b.npy", "isosurface:5"))
+    assert network.name == NETWORK
+    assert network.config is not None
+    assert (
+        options_of(network.config)
+        == "--profile network --feature 'mask:a b.npy' --feature isosurface:5"
+    )
+    assert options_of(EncodeConfig(timings=False)) == "--no-timings"
 
 
 def point(name: str, codec: str, seconds: float | None, size: int, psnr: float | None) -> Encoded:
@@ -421,32 +469,49 @@ def point(name: str, codec: str, seconds: float | None, size: int, psnr: float |
 
 POINTS = [
     point("fast", "compact", 1.0, 2000, 46.0),
+    point("faster", "compact", 0.9, 9900, 51.0),
     point("small", "compact", 9.0, 1000, 45.0),
-    point("peer", "SZ3", 0.1, 3000, 46.0),
-    point("good", "compact", 5.0, 9000, 61.0),
+    point("as small", "compact", 8.0, 1005, 45.0),
+    point("peer", "SZ3", 0.1, 300, 46.0),
+    point(DEFAULT, "compact", 5.0, 9000, 61.0),
     point("only predicted", "compact", None, 1, 99.0),
 ]
 
 
-def test_smallest_and_fastest_of_what_reaches_an_accuracy() -> None:
-    advice = advise(POINTS, (35.0, 45.0, 50.0, 60.0, 70.0))
-    assert [(entry.psnr, entry.aim, entry.name) for entry in advice] == [
-        (45.0, "smallest", "small"),
-        (45.0, "fastest", "fast"),
-        (45.0, "smallest peer", "peer"),
-        (60.0, "smallest", "good"),
+def told(points: Sequence[Encoded]) -> list[tuple[str, str, str]]:
+    return [(entry.goal, entry.aim, entry.name) for entry in advise(points, 10.0)]
+
+
+def test_fastest_smallest_and_default_of_what_reaches_an_accuracy() -> None:
+    points = [replace(each, group=each.name if each.name != DEFAULT else "a") for each in POINTS]
+    assert told(points)[3:7] == [
+        ("45 dB", "fastest", "fast"),
+        ("45 dB", "smallest", "as small"),
+        ("45 dB", "default", DEFAULT),
+        ("50 dB", "fastest", "faster"),
     ]
+    assert told(points)[-1] == ("60 dB", "default", DEFAULT)
+    # Without one at the default effort there is no advice to take it.
+    assert {aim for _, aim, _ in told(POINTS[:4])} == {"fastest", "smallest"}
+
+
+def test_a_largest_error_must_be_promised() -> None:
+    close = replace(POINTS[0], psnr=30.0, max_abs_error=0.1)
+    bound = replace(close, name="bound", options="--max-error-rel 0.01")
+    finer = replace(bound, name="finer", seconds=0.1, bytes=9000, max_abs_error=0.02)
+    assert told([close, bound, finer]) == [
+        ("within 1 %", aim, "bound") for aim in ("fastest", "smallest")
+    ]
+    assert told([replace(bound, max_abs_error=0.1001)]) == []
+    assert told([replace(bound, max_abs_error=None)]) == []
 
 
 def test_exact_values_reach_every_accuracy() -> None:
-    (entry,) = advise([point("exact", "compact", 2.0, 5000, None)], (40.0, 70.0))
-    assert (entry.psnr, entry.reached) == (70.0, None)
-    assert advise([POINTS[-1]]) == ()
-
-
-def test_a_line_of_advice() -> None:
-    (first, *_) = advise(POINTS[:1], (45.0,))
-    assert told(first) == "45 dB: 1 s, 2 kB, the smallest: fast"
+    entries = advise([point("exact", "compact", 2.0, 5000, None)], 10.0)
+    goals = {entry.goal for entry in entries}
+    assert goals == {"40 dB", "45 dB", "50 dB", "60 dB", "within 1 %", "within 0.1 %"}
+    assert {(entry.psnr, entry.max_error_rel) for entry in entries} >= {(40.0, None), (None, 0.01)}
+    assert {entry.reached for entry in entries} == {None}
 
 
 @pytest.mark.parametrize(
@@ -457,10 +522,18 @@ def test_sizes_in_three_digits(count: float, text: str) -> None:
     assert bytes_text(count) == text
 
 
+def test_times_are_never_powers_of_ten() -> None:
+    assert [seconds_text(ms, "ms") for ms in (0.834, 12.4, 1234.0)] == [
+        "0.83 ms",
+        "12 ms",
+        "1234 ms",
+    ]
+
+
 def test_a_report_is_json_with_every_field(report: CostReport) -> None:
     values = json.loads(json.dumps(report.to_dict()))
     assert list(values) == [field.name for field in fields(CostReport)]
-    assert [entry["measured"] for entry in values["encodings"]] == [True, True, False]
+    assert [entry["measured"] for entry in values["encodings"]] == [True, True, True, False]
     assert values["pictures"][0]["counters"]["secondary_rays"] == 0
 
 
@@ -553,7 +626,7 @@ def test_without_time_or_package_they_are_left_out(
     assert "fhash[bench]" in entry.why
 
 
-FAST = Wish(codec="compact", group="compact, effort 1", config=EncodeConfig(effort=1, psnr=40.0))
+FAST = Wish(codec="compact", group="effort 1", config=EncodeConfig(effort=1, psnr=40.0))
 
 
 def foretold(config: EncodeConfig) -> Prediction:
@@ -600,14 +673,18 @@ def test_an_encoding_that_overruns_is_no_point(series: ArraySeries, tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_paper_trains_one_epoch_and_then_as_many_as_fit(
-    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(own, "EPOCHS", (2, 10**6))
-    encodings = OwnEncodings(series, tmp_path, Allowance(1000.0), foretold, silent)
-    encodings.measure(Wish(codec="paper", group="paper"))
-    assert [point.name for point in encodings.points] == ["paper, 1 epoch", "paper, 2 epochs"]
-    assert [len(curve.points) for curve in encodings.curves] == [1, 2]
+def test_the_default_and_the_network_need_no_time_left(series: ArraySeries, tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    allowance = Allowance(1e-9)
+    encodings = OwnEncodings(series, tmp_path, allowance, foretold, silent)
+    for wish in (*wishes(), *wishes()):
+        if wish.codec not in PEERS:
+            encodings.measure(wish)
+    measured = [point for point in encodings.points if point.measured]
+    assert [point.name for point in measured] == [DEFAULT, NETWORK]
+    assert all((point.region_ms or 0) > 0 for point in measured)
+    assert [curve.name for curve in encodings.curves][-1] == NETWORK
+    assert not {DEFAULT, NETWORK} & {entry.what for entry in allowance.left_out}
     assert list(tmp_path.glob("*.checkpoint")) == []
 
 
@@ -643,7 +720,7 @@ PRICE = own.ModelPrice(
         ({"bytes": 1400, "region_ms": 3.0}, "balanced", 60, "compact", "the fewest bytes"),
         ({"bytes": 1400, "region_ms": 3.0}, "fast", 60, "paper", "1.40 times"),
         ({"bytes": 900, "kept": False}, "small", 60, "compact", "does not keep the promise"),
-        ({"bytes": 5000, "seconds": 4.0}, "small", 5, "paper", "longer than 5.00 s"),
+        ({"bytes": 5000, "seconds": 4.0}, "small", 5, "paper", "longer than 5 s"),
         ({"bytes": 500, "seconds": 20.0}, "small", 5, "compact", "too few for either"),
     ],
 )
