@@ -55,15 +55,12 @@ class Stream:
     """One march.
 
     Attributes:
-        budget: N_r, None for the number of rays.
         psnr: dB to the picture of the cached march, None where nothing differs.
         largest: largest difference to that picture, 0..1.
     """
 
     mode: str
-    budget: int | None
     milliseconds: float
-    passes: int
     samples: int
     evaluations: int
     psnr: float | None
