@@ -66,11 +66,8 @@ def bench_points(
     ]
     network = _network(architecture, layers, tables)
     time = 0.37 * (network.key_frames - 1)
-    results = []
-    for order, places in (
-        ("rays", _rays(architecture.box_size)),
-        ("random", _random(architecture.box_size)),
-    ):
+    box, results = architecture.box_size, []
+    for order, places in (("rays", _rays(box)), ("random", _random(box))):
         for gradient in (False, True):
             for number in threads:
                 spent = []

@@ -230,7 +230,8 @@ def _repeat_lost(lost: sys.UnraisableHookArgs) -> None:
     """Send a signal again whose KeyboardInterrupt Python ignored, in a weak reference's callback
     or a destructor: the command would run on to its end."""
     if not isinstance(lost.exc_value, KeyboardInterrupt):
-        return sys.__unraisablehook__(lost)
+        sys.__unraisablehook__(lost)
+        return
     number, *_ = *lost.exc_value.args, signal.SIGINT  # Python's own handler gives no number
     # Sent to the process it ends a sleep of the main thread; on Windows that would kill.
     send = partial(os.kill, os.getpid()) if os.name == "posix" else signal.raise_signal
