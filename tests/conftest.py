@@ -52,8 +52,8 @@ LONG_ROOMS = (
 that of the published figures: what they are wrong in is read by others."""
 QUICK_CASES = 2
 """Cases of a parametrised test that the quick set runs."""
-WHOLE_ROOMS = ("documents",)
-"""Rooms whose cases all run: each is another page that somebody reads."""
+WHOLE_ROOMS = ("documents", "tests")
+"""Folders whose cases all run: each is another page that somebody reads, or another law."""
 SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
 """Names of files that take a good part of a minute."""
 

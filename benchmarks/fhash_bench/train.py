@@ -17,7 +17,7 @@ import torch
 
 from fhash_bench.engines import GOALS, EngineFigures, EngineRun, Peak, Peaks, Variant, now
 from fhash_bench.rate.generated import DEFAULT, is_made, made_series
-from fhash_codec.boxes import Box, TableSource
+from fhash_codec.boxes import Box, Sizes, TableSource
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.cost.report import require_matplotlib
 from fhash_codec.devices import choose_device, machine, threads_for
@@ -74,8 +74,9 @@ def bench_points(
     ]
     network = _network(architecture, layers, tables)
     time = 0.37 * (network.key_frames - 1)
+    box = architecture.box_size
     results: list[PointRate] = []
-    for order, places in (("rays", _rays(network)), ("random", _random(network))):
+    for order, places in (("rays", _rays(box)), ("random", _random(box))):
         for gradient in (False, True):
             for number in threads:
                 spent = []
@@ -113,22 +114,22 @@ def _network(
     )
 
 
-def _rays(network: Network) -> Points:
+def _rays(box: Sizes) -> Points:
     """Points (3, n) along straight lines through the box, one line after the other."""
     random = np.random.default_rng(1)
     ends = random.random((2, POINTS // RAY_POINTS, 1, 3))
     along = np.linspace(0, 1, RAY_POINTS)[:, None]
     places = (1 - along) * ends[0] + along * ends[1]
-    return np.ascontiguousarray(places.reshape(-1, 3).T) * _last(network)
+    return np.ascontiguousarray(places.reshape(-1, 3).T) * _last(box)
 
 
-def _random(network: Network) -> Points:
+def _random(box: Sizes) -> Points:
     """Points (3, n) anywhere in the box."""
-    return np.random.default_rng(2).random((3, POINTS)) * _last(network)
+    return np.random.default_rng(2).random((3, POINTS)) * _last(box)
 
 
-def _last(network: Network) -> Points:
-    return np.array(network.box_size, np.float64)[:, None] - 1
+def _last(box: Sizes) -> Points:
+    return np.array(box, np.float64)[:, None] - 1
 
 
 DECODE_TURNS = 5

@@ -10,10 +10,12 @@ import importlib
 import os
 import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from types import FrameType
 from typing import Any, cast
 
@@ -209,6 +211,7 @@ def _heed_signals() -> None:
 
     A signal that is ignored (nohup) stays ignored.
     """
+    sys.unraisablehook = _repeat_lost
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
@@ -216,7 +219,23 @@ def _heed_signals() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+    raise KeyboardInterrupt(number)
+
+
+LOST_SECONDS = 0.01
+"""Time after which a lost signal comes again; by then its callback has usually ended."""
+
+
+def _repeat_lost(lost: sys.UnraisableHookArgs) -> None:
+    """Send a signal again whose KeyboardInterrupt Python ignored, in a weak reference's callback
+    or a destructor: the command would run on to its end."""
+    if not isinstance(lost.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    number, *_ = *lost.exc_value.args, signal.SIGINT  # Python's own handler gives no number
+    # Sent to the process it ends a sleep of the main thread; on Windows that would kill.
+    send = partial(os.kill, os.getpid()) if os.name == "posix" else signal.raise_signal
+    threading.Timer(LOST_SECONDS, send, [number]).start()
 
 
 MALLOC = {-8: 1, -3: 32 << 20, -1: 256 << 20}

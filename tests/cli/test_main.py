@@ -156,7 +156,7 @@ else:
     name = "add_array"  # of a paper file, and of a compact one of a single tile
 def sleeping(*_, **__):
     print("ready", file=sys.stderr, flush=True)
-    time.sleep(60)
+    time.sleep(10)  # frames are read in a thread, which is waited for
 setattr(Slow, name, sleeping)
 main.main()
 """
@@ -198,6 +198,34 @@ def test_a_signal_leaves_nothing_half_written(
     if command == "encode":
         assert "is not written, and the same command starts again" in rest
     assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".checkpoint")] == []
+
+
+LOSING = """
+import signal, time, weakref
+from fhash_cli import main
+from fhash_formats.container import ContainerWriter
+add_array = ContainerWriter.add_array
+def losing(*given, **more):
+    thing = weakref.WeakSet()
+    watch = weakref.ref(thing, lambda _: signal.raise_signal(signal.NAME))
+    del thing  # Python ignores what the callback raises
+    time.sleep(10)
+    return add_array(*given, **more)
+ContainerWriter.add_array = losing
+main.main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGHUP there")
+@pytest.mark.parametrize("name", SIGNALS)
+def test_a_signal_that_python_ignores_comes_again(data: Path, tmp_path: Path, name: str) -> None:
+    words = ["encode", data, "-o", tmp_path / "out.fhz", "--effort", "1"]
+    code = [sys.executable, "-c", LOSING.replace("NAME", name)]
+    done = subprocess.run([*code, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("fhash: error: interrupted")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGHUP there")

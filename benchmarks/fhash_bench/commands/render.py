@@ -172,11 +172,10 @@ TABLES: tuple[tuple[str, tuple[str, ...], Callable[[Any], tuple[str, ...]]], ...
     ),
     (  # the marchers that evaluate the model itself
         "streams",
-        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
+        ("march", "ms", "samples", "evaluations", "PSNR", "largest"),
         lambda run: (
-            run.mode if run.budget is None else f"{run.mode}, N_r {run.budget:,}",
+            run.mode,
             _ms(run.milliseconds),
-            f"{run.passes:,}",
             f"{run.samples:,}",
             f"{run.evaluations:,}",
             _decibels(run.psnr),

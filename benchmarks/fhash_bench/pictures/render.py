@@ -330,40 +330,31 @@ class _Bench:
         return tuple(found)
 
     def streams(self) -> tuple[Stream, ...]:
-        """Measure the cached march, streaming, and adaptive ray marching on a small picture.
-
-        Adaptive ray marching runs with N_r equal to the number of rays and to 2^20.
-        """
+        """Measure the cached march, streaming, and adaptive ray marching on a small picture."""
         small = replace(
             self.scene, size=(STREAM_SIZE, STREAM_SIZE), march=replace(self.scene.march, lod=0)
         )
         variants = {
-            "cache": replace(small, march=replace(small.march, mode="cache")),
-            "stream": replace(small, march=replace(small.march, mode="stream")),
-            "arm": replace(small, march=replace(small.march, mode="arm", samples_per_pass=None)),
-            "arm, N_r 2^20": replace(
-                small, march=replace(small.march, mode="arm", samples_per_pass=2**20)
-            ),
+            mode: replace(small, march=replace(small.march, mode=mode))
+            for mode in ("cache", "stream", "arm")
         }
         # A whole turn takes seconds through the model: the fewest that have a median.
         measured = in_turns(
-            {name: partial(self.renderer.render, scene) for name, scene in variants.items()},
+            {mode: partial(self.renderer.render, scene) for mode, scene in variants.items()},
             min(self.turns, 3),
         )
         self.progress("streams", 1, 1, "")
         _, cached = measured["cache"]
         return tuple(
             Stream(
-                mode=variants[name].march.mode,
-                budget=variants[name].march.samples_per_pass,
+                mode=mode,
                 milliseconds=milliseconds,
-                passes=int(image.counters["passes"]),
                 samples=int(image.counters["samples"]),
                 evaluations=int(image.counters["evaluations"]),
                 psnr=picture_psnr(image.rgba, cached.rgba, 1.0),
                 largest=float(np.max(np.abs(image.rgba - cached.rgba))),
             )
-            for name, (milliseconds, image) in measured.items()
+            for mode, (milliseconds, image) in measured.items()
         )
 
     def curves(self) -> tuple[Quality, ...]:

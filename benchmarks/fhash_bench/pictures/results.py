@@ -50,9 +50,7 @@ class Stream:
     """One march."""
 
     mode: Annotated[str, "way to march"]
-    budget: Annotated[int | None, "N_r, null for the number of rays"]
     milliseconds: Annotated[float, "of a picture"]
-    passes: Annotated[int, "its counters"]
     samples: Annotated[int, "its counters"]
     evaluations: Annotated[int, "its counters"]
     psnr: Annotated[float | None, "dB to the picture of the cached march; null where equal"]
