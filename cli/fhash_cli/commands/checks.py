@@ -32,7 +32,7 @@ from fhash_cli.output import (
 from fhash_formats.errors import QualityError
 
 
-@click.command("verify", cls=BaseCommand)
+@click.command("verify", cls=BaseCommand, epilog="fhash verify run.fhz")
 @run_argument
 @variable_option
 @json_option
@@ -50,7 +50,7 @@ def verify_command(run: str, variable: str | None, as_json: bool, quiet: bool) -
     )
 
 
-@click.command("diff", cls=BaseCommand)
+@click.command("diff", cls=BaseCommand, epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01")
 @click.argument("data", type=click.Path())
 @run_argument
 @series_options
