@@ -77,6 +77,8 @@ def _prose(command: click.Command) -> str:
             made.append(f"```text\n{lines}\n```")
         else:
             made.append(_cell(paragraph))
+    if command.epilog:
+        made.append(f"```console\n{command.epilog}\n```")
     return "\n\n".join(made)
 
 

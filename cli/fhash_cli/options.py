@@ -260,6 +260,13 @@ def group_of(command: str, option: click.Option) -> str:
     return next((title for title, members in GROUPS.items() if set(names) & set(members)), OTHERS)
 
 
+EXIT_CODES = (
+    "0 success; 1 failure; 2 usage or unsuitable input; 3 a promise or gate missed; 4 damaged or"
+    " unsupported file; 130 interrupted."
+)
+"""Meanings of the exit codes, which are those of every command."""
+
+
 class BaseCommand(click.Command):
     """A command whose help lists its options by purpose, and which takes single values once."""
 
@@ -285,6 +292,13 @@ class BaseCommand(click.Command):
         for title in [title for title in first if title not in last] + last:
             with formatter.section(title):
                 formatter.write_dl(rows[title])
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The lines of `epilog` as examples, as they are typed, and the exit codes."""
+        with formatter.section("Examples"):
+            formatter.write("".join(f"  {line}\n" for line in (self.epilog or "").splitlines()))
+        with formatter.section("Exit codes"):
+            formatter.write_text(EXIT_CODES)
 
 
 class BaseGroup(click.Group):

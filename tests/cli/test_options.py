@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -158,6 +160,18 @@ def test_every_command_is_of_this_kind_and_names_each_option_once(command: click
             option for option in command.get_params(context) if isinstance(option, click.Option)
         ]
     assert sorted(lines) == sorted(min(option.opts, key=len) for option in options)
+
+
+@pytest.mark.parametrize("command", tuple(commands()), ids=lambda command: str(command.name))
+def test_help_has_examples_that_are_commands(fhash: Fhash, command: click.Command) -> None:
+    lines = (command.epilog or "").splitlines()
+    assert any(f"fhash {command.name}" in line.replace("bench ", "") for line in lines)
+    for line in lines:
+        assert len(line) <= 96
+        words = re.search(r"fhash ([^)]*)", line)
+        assert words
+        assert fhash(*shlex.split(words[1]), "--help").exit_code == 0
+    assert "130 interrupted" in command.get_help(click.Context(command))
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,10 @@ SHOWN = ("text", "toml", "c", "js", "xml", "json", "fortran", "cmake")
 """Languages of blocks that nobody runs: outputs, files, and code of other languages."""
 ELSEWHERE = "console"
 """Language of commands that need another machine or a window; their options are checked."""
+ENDLESS = ("serve", "view", "paraview", "completion", "bench", "cost", "selftest")
+"""Commands whose examples wait for Ctrl-C, print code, or take minutes."""
+LONG = ("fhash demo",)
+"""Further examples that take long; other tests run them."""
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*\.?\d*(?:e-?\d+)?")
 
 
@@ -172,6 +176,17 @@ def check_options(text: str, place: str) -> None:
             continue
         shown = CliRunner().invoke(program, [*words[1:], "--help"])
         assert shown.exit_code == 0, f"{place}: {line}: {shown.output}"
+
+
+def test_examples_of_the_help_run(folder: Path) -> None:
+    epilogs = {
+        name: (command.epilog or "").splitlines()
+        for name in program.list_commands(click.Context(program))
+        if (command := program.get_command(click.Context(program), name)) and name not in ENDLESS
+    }
+    assert sum(map(len, epilogs.values())) > 20
+    for lines in epilogs.values():
+        shell("\n".join(line for line in lines if line not in LONG), folder)
 
 
 def code_of(notebook: Path) -> Iterator[str]:

@@ -32,7 +32,12 @@ def _names(constant: str) -> Callable[[], tuple[str, ...]]:
     return names
 
 
-@click.command("paper", cls=BaseCommand, short_help="the paper's encodings, trained side by side")
+@click.command(
+    "paper",
+    cls=BaseCommand,
+    short_help="the paper's encodings, trained side by side",
+    epilog="fhash bench paper --quick",
+)
 @click.argument("data", type=click.Path(), required=False)
 @series_options
 @click.option(

@@ -144,6 +144,7 @@ def _accesses() -> tuple[str, ...]:
     "rate",
     cls=BaseCommand,
     short_help="size, speed and access beside other codecs, at equal quality",
+    epilog="fhash bench rate demo/vortex.h5 --profile compact --target 50 --bound 0.01",
 )
 @click.argument("data", type=click.Path())
 @series_options
@@ -320,6 +321,7 @@ def access_rows(result: RateBench) -> list[tuple[str, ...]]:
     "table",
     cls=BaseCommand,
     short_help="size, speed and access on many series, one core, as one table; goes on",
+    epilog="fhash bench table generated:smooth --target 45",
 )
 @click.argument("data", type=click.Path(), nargs=-1)
 @series_options
@@ -459,7 +461,12 @@ def _table_text(result: RateTable) -> str:
     )
 
 
-@click.command("labels", cls=BaseCommand, short_help="sizes of labels without loss, beside xz")
+@click.command(
+    "labels",
+    cls=BaseCommand,
+    short_help="sizes of labels without loss, beside xz",
+    epilog="fhash bench labels",
+)
 @click.argument("data", type=click.Path(), required=False)
 @series_options
 @click.option(

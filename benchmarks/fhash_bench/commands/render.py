@@ -28,7 +28,12 @@ def _parts() -> tuple[str, ...]:
     return PARTS
 
 
-@click.command("render", cls=BaseCommand, short_help="time and quality of pictures, beside VTK")
+@click.command(
+    "render",
+    cls=BaseCommand,
+    short_help="time and quality of pictures, beside VTK",
+    epilog="fhash bench render run.fhz --part effects --size 128 --turns 1",
+)
 @run_argument
 @click.option(
     "--scene",

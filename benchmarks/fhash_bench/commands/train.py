@@ -58,7 +58,12 @@ BRICKS = TextType("N,M", _numbers_of_bricks)
 """Numbers of bricks, separated by commas."""
 
 
-@click.command("train", cls=BaseCommand, short_help="training and inference speed of each engine")
+@click.command(
+    "train",
+    cls=BaseCommand,
+    short_help="training and inference speed of each engine",
+    epilog="fhash bench train demo/vortex.h5 --seconds 2",
+)
 @click.argument("data", type=click.Path(), required=False)
 @series_options
 @click.option("--engines", type=ENGINES, help="Which to measure. Default: all there are.")
@@ -223,7 +228,12 @@ def _points(points: list[PointRate]) -> str:
     return f"points, M per CPU s: {', '.join(rates)}"
 
 
-@click.command("ablate", cls=BaseCommand, short_help="what each setting changes, one at a time")
+@click.command(
+    "ablate",
+    cls=BaseCommand,
+    short_help="what each setting changes, one at a time",
+    epilog="fhash bench ablate demo/vortex.h5 --axis tile",
+)
 @click.argument("data", type=click.Path(), required=False)
 @series_options
 @click.option(

@@ -43,7 +43,7 @@ class Verified(TypedDict):
     arrays: Annotated[int, "number of arrays that were read and checked"]
 
 
-@click.command("verify", cls=BaseCommand)
+@click.command("verify", cls=BaseCommand, epilog="fhash verify run.fhz")
 @run_argument
 @variable_option
 @json_option
@@ -58,7 +58,7 @@ def verify_command(run: str, variable: str | None, as_json: bool, quiet: bool) -
     emit(result, f"{one_line(run)}: sound, {arrays} arrays checked", as_json)
 
 
-@click.command("diff", cls=BaseCommand)
+@click.command("diff", cls=BaseCommand, epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01")
 @click.argument("data", type=click.Path())
 @run_argument
 @series_options

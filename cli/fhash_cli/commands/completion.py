@@ -14,7 +14,7 @@ SHELLS = ("bash", "zsh", "fish")
 """Shells that click writes code for."""
 
 
-@click.command("completion", cls=BaseCommand)
+@click.command("completion", cls=BaseCommand, epilog='eval "$(fhash completion bash)"')
 @click.argument("shell", metavar="SHELL", type=click.Choice(SHELLS))
 @click.pass_context
 def command(context: click.Context, shell: str) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fhash_codec.cost.results import CostReport
 
 
-@click.command("cost", cls=BaseCommand)
+@click.command("cost", cls=BaseCommand, epilog="fhash cost demo/vortex.h5 --budget 1m")
 @click.argument("data", type=click.Path())
 @click.option(
     "-o",

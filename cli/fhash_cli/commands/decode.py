@@ -325,7 +325,13 @@ INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 TYPES = ("float16", "float32", "float64", *INTEGERS)
 
 
-@click.command("decode", cls=BaseCommand)
+@click.command(
+    "decode",
+    cls=BaseCommand,
+    epilog="fhash decode run.fhz\n"
+    "fhash decode run.fhz --t 12 --roi 0:16,20:36,: -o part.vti\n"
+    "fhash decode run.fhz --time 0.55 -o between.npy",
+)
 @run_argument
 @variables_option
 @click.option(

@@ -126,7 +126,12 @@ scene_options = option_group(
         help="Vertices along z, y and x, such as 54,172,200 or x=200,y=172,z=54. Default: a small"
         " shape of the scene's own.",
     ),
-    click.option("--steps", type=click.IntRange(1), metavar="N", help="Number of steps."),
+    click.option(
+        "--steps",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Number of steps. Default: a small number of the scene's own.",
+    ),
     click.option(
         "--paper-shape",
         is_flag=True,
@@ -284,7 +289,11 @@ COLUMNS = 4
 """Steps that the picture shows side by side."""
 
 
-@click.command("demo", cls=BaseCommand)
+@click.command(
+    "demo",
+    cls=BaseCommand,
+    epilog="fhash demo\nfhash demo --scene flame --shape 16,32,32 --steps 8 -o flame.h5",
+)
 @scene_options
 @click.option(
     "-o",

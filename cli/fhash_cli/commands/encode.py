@@ -82,7 +82,13 @@ class Chosen(TypedDict, total=False):
     time_budget: Annotated[TimeBudget, "`--time-budget`: the choice of effort or epochs"]
 
 
-@click.command("encode", cls=BaseCommand)
+@click.command(
+    "encode",
+    cls=BaseCommand,
+    epilog="fhash encode demo/vortex.h5 -o bound.fhz --max-error 0.01\n"
+    "fhash encode demo/vortex.h5 -o small.fhz --ratio 200 --effort 2\n"
+    "fhash encode demo/vortex.h5 -o swirl.fhz --feature interval:0.08:2 --psnr 45",
+)
 @click.argument("data", type=click.Path())
 @click.option(
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."

@@ -301,7 +301,11 @@ def positions(coordinate: Coordinate, axis: str) -> str:
     return f"{coordinate.name} {dates} ({numbers} {units})"
 
 
-@click.command("info", cls=BaseCommand)
+@click.command(
+    "info",
+    cls=BaseCommand,
+    epilog="fhash info demo/vortex.h5\nfhash info run.fhz --json",
+)
 @click.argument("path", metavar="RUN.fhz|DATA", type=click.Path())
 @series_options
 @click.option("-v", "--verbose", is_flag=True, help="Every setting, level and layer of RUN.fhz.")

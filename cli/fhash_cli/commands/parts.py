@@ -44,7 +44,12 @@ class PlanReport(TypedDict):
     value_range: Annotated[list[float], "the least and the greatest value"]
 
 
-@click.command("plan", cls=BaseCommand)
+@click.command(
+    "plan",
+    cls=BaseCommand,
+    epilog="fhash plan demo/vortex.h5 -o run.plan --max-error 0.01 --tile 8x32x32x32\n"
+    "fhash encode demo/vortex.h5 --plan run.plan --part 1/2 -o first.fhz",
+)
 @click.argument("data", type=click.Path())
 @click.option(
     "-o", "output", metavar="RUN.plan", required=True, type=click.Path(), help="Where to write."
@@ -95,7 +100,13 @@ def plan_command(
     emit(report, table(rows), as_json)
 
 
-@click.command("merge", cls=BaseCommand)
+@click.command(
+    "merge",
+    cls=BaseCommand,
+    epilog="fhash encode demo/vortex.h5 --max-error 0.01 --tile 8x32x32x32 --part 1/2 -o 1.fhz\n"
+    "fhash encode demo/vortex.h5 --max-error 0.01 --tile 8x32x32x32 --part 2/2 -o 2.fhz\n"
+    "fhash merge 1.fhz 2.fhz -o whole.fhz",
+)
 @click.argument("parts", metavar="PART.fhz...", nargs=-1, required=True, type=click.Path())
 @click.option(
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
@@ -190,7 +201,12 @@ def _given(config: EncodeConfig) -> dict[str, Any]:
     }
 
 
-@click.command("append", cls=BaseCommand)
+@click.command(
+    "append",
+    cls=BaseCommand,
+    epilog="fhash encode demo/vortex.h5 --t :8 -o long.fhz --max-error 0.01 --tile 8x32x32x32\n"
+    "fhash append long.fhz demo/vortex.h5 --t 8:",
+)
 @run_argument
 @click.argument("data", type=click.Path())
 @series_options

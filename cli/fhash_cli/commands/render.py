@@ -195,11 +195,18 @@ class Setting(NamedTuple):
             record = (*typing.get_args(hint), hint)[0]  # of a record or None
         hint = typing.get_type_hints(record)[last]
         number = next((kind for kind in (int, float) if hint in (kind, kind | None)), None)
+        field = next(each for each in dataclasses.fields(record) if each.name == last)
         text = self.help
         if text is None:
-            field = next(each for each in dataclasses.fields(record) if each.name == last)
             choices = ", ".join(field.metadata["choices"])
             text = field.metadata["help"] + (f": {choices}" if choices else "")
+        notes = []
+        if isinstance(field.default, str | int | float) and "default" not in text:
+            notes.append(f"default: {field.default}")
+        if number is not None and field.metadata["high"] < 1e12:  # more is met by nobody
+            notes.append(f"{field.metadata['low']:g}<=x<={field.metadata['high']:g}")
+        if notes:
+            text += f".  [{'; '.join(notes)}]"
         return click.option(
             self.flag,
             self.name,
@@ -446,10 +453,16 @@ add_animation_options = option_group(
         " or a file (TOML, JSON). Times may be dates.",
     ),
     click.option(
-        "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
+        "--frames",
+        type=click.IntRange(1, 100_000),
+        metavar="N",
+        help="Pictures of an animation. Default: one for each step if whole steps pass, else 96.",
     ),
     click.option(
-        "--fps", type=RealRange(0.1, 240), metavar="X", help="Pictures per second of a film."
+        "--fps",
+        type=RealRange(0.1, 240),
+        metavar="X",
+        help="Pictures per second of a film. Default: 24, or 8 where each is a step.",
     ),
     click.option(
         "--pictures",
@@ -659,7 +672,9 @@ class Rendered(TypedDict):
     plan: NotRequired[Annotated[dict[str, str], "`--explain`: what was decided, and why"]]
 
 
-@click.command("render", cls=BaseCommand)
+@click.command(
+    "render", cls=BaseCommand, epilog="fhash render run.fhz -o last.png --t -1 --effect shading"
+)
 @run_argument
 @variable_option
 @click.option(

@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from fhash_codec.selftest.run import Summary
 
 
-@click.command("selftest", cls=BaseCommand)
+@click.command(
+    "selftest",
+    cls=BaseCommand,
+    epilog="fhash selftest\nfhash selftest --group rays --report rays.md",
+)
 @click.option(
     "--all",
     "everything",

@@ -38,10 +38,15 @@ class Written(TypedDict):
     bytes: Annotated[int, "size of these files"]
 
 
-@click.command("view", cls=BaseCommand)
+@click.command(
+    "view",
+    cls=BaseCommand,
+    epilog="fhash view run.fhz\nfhash view run.fhz --static site",
+)
 @click.argument("runs", metavar="RUN.fhz...", nargs=-1, required=True, type=click.Path())
 @click.option(
     "--port",
+    metavar="N",
     type=click.IntRange(0, 65535),
     default=PORT,
     show_default=True,
@@ -117,7 +122,11 @@ def _print(*lines: object) -> None:
         click.echo(line)
 
 
-@click.command("hdf5-plugin-path", cls=BaseCommand)
+@click.command(
+    "hdf5-plugin-path",
+    cls=BaseCommand,
+    epilog="export HDF5_PLUGIN_PATH=$(fhash hdf5-plugin-path)",
+)
 def hdf5_plugin_path_command() -> None:
     """Print the folder of the filter for HDF5, which programs look for in HDF5_PLUGIN_PATH.
 
@@ -128,7 +137,7 @@ def hdf5_plugin_path_command() -> None:
     _print(FOLDER)
 
 
-@click.command("paraview", cls=BaseCommand)
+@click.command("paraview", cls=BaseCommand, epilog="fhash paraview run.fhz")
 @click.argument("files", metavar="[FILE]...", nargs=-1, type=click.Path(path_type=Path))
 def paraview_command(files: tuple[Path, ...]) -> None:
     """Start ParaView with its reader of .fhz files and with FILEs; or print the reader's path.

@@ -35,7 +35,11 @@ class PackOptions:
     absent: str
 
 
-@click.command("pack", cls=BaseCommand)
+@click.command(
+    "pack",
+    cls=BaseCommand,
+    epilog="fhash unpack run.fhz -o coded.zarr\nfhash pack coded.zarr -o again.fhz",
+)
 @click.argument("data", metavar="RUN.zarr", type=click.Path())
 @click.option(
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
@@ -105,7 +109,7 @@ def pack_command(
     emit(report, table(rows), as_json)
 
 
-@click.command("unpack", cls=BaseCommand)
+@click.command("unpack", cls=BaseCommand, epilog="fhash unpack run.fhz -o run.zarr")
 @run_argument
 @click.option(
     "-o", "output", metavar="RUN.zarr", required=True, type=click.Path(), help="Where to write."
@@ -133,9 +137,11 @@ def unpack_command(
     emit(report, table(rows), as_json)
 
 
-@click.command("export", cls=BaseCommand)
+@click.command("export", cls=BaseCommand, epilog="fhash export run.fhz -o plain.fhz --plain")
 @run_argument
-@click.option("-o", "output", metavar="PLAIN.fhz", required=True, type=click.Path())
+@click.option(
+    "-o", "output", metavar="PLAIN.fhz", required=True, type=click.Path(), help="Where to write."
+)
 @click.option(
     "--plain",
     is_flag=True,
@@ -183,10 +189,11 @@ class Served(TypedDict):
     arrays: Annotated[list[str], "names of the arrays of values, one for each variable"]
 
 
-@click.command("serve", cls=BaseCommand)
+@click.command("serve", cls=BaseCommand, epilog="fhash serve run.fhz --port 8642")
 @run_argument
 @click.option(
     "--port",
+    metavar="N",
     type=click.IntRange(0, 65535),
     default=PORT,
     show_default=True,
@@ -194,6 +201,7 @@ class Served(TypedDict):
 )
 @click.option(
     "--host",
+    metavar="ADDRESS",
     default="127.0.0.1",
     show_default=True,
     help="Address to listen at. The default is this machine alone; 0.0.0.0 is every address of it,"
