@@ -56,6 +56,8 @@ if "linux" in (TARGET or sys.platform):
 LIBFHASH_FLAGS = (
     (f"-Wl,--version-script={FORMATS / 'exports.map'}", "-Wl,-soname,libfhash.so")
     if "linux" in (TARGET or sys.platform)
+    else ("-Wl,-install_name,@rpath/libfhash.so",)
+    if "macos" in TARGET or (sys.platform == "darwin" and not TARGET)
     else ()
 )
 """The interface alone is exported, and nothing of the standard library; programs find the library

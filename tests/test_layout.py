@@ -107,13 +107,13 @@ def test_version_is_the_same_everywhere() -> None:
 
 
 def test_packages_of_conda_and_spack_need_what_pip_installs() -> None:
-    """Version and requirements in `packaging/` are those of pyproject.toml."""
+    """Version and requirements in `recipes/` are those of pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     required = {f"python{project['requires-python']}", *project["dependencies"]}
-    conda = (ROOT / "packaging/conda/recipe.yaml").read_text()
+    conda = (ROOT / "recipes/conda/recipe.yaml").read_text()
     run = conda.split("\n  run:\n")[1].split("\n\n")[0]
     assert {line.strip("- ").replace(" ", "") for line in run.splitlines()} == required
-    spack = (ROOT / "packaging/spack/package.py").read_text()
+    spack = (ROOT / "recipes/spack/package.py").read_text()
     needed = re.findall(r'depends_on\("(?:py-)?([a-z0-9]+)@([0-9.]+):"', spack)
     assert {f"{name}>={version}" for name, version in needed} - {"setuptools>=77"} == required
     assert f'version: "{project["version"]}"' in conda

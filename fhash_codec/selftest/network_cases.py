@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.devices import choose_device
+from fhash_codec.devices import choose_device, has_torch
 from fhash_codec.encoding import encode
 from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import ArrayTable, Network, NumberType
@@ -20,7 +20,7 @@ from fhash_codec.paper.storage import load_network
 from fhash_codec.selftest.case import Case, Check, Finding, Run, as_floats
 from fhash_codec.selftest.field_cases import Settings, noise, single, spike, waves
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.support.values import Double
 
 UNIT = 2.0**-24
@@ -229,7 +229,9 @@ def diverged(run: Run) -> Iterator[Finding]:
 
 
 def engines(run: Run) -> Iterator[Finding]:
-    """The engine slab trains the same network as the one that is chosen."""
+    """The engine slab trains the same network as the one that is chosen, where there is torch."""
+    if not has_torch():
+        return
     yield _apart(run, "auto = slab", replace(run.config, engine="slab"), MAX_ENGINE_DIFFERENCE)
 
 
@@ -237,7 +239,7 @@ def devices(run: Run) -> Iterator[Finding]:
     """A CUDA device trains the same network as the CPU; nothing is compared without CUDA."""
     try:
         choose_device("cuda")
-    except InputError:
+    except (InputError, MissingDependencyError):
         return
     yield _apart(run, "cuda = cpu", replace(run.config, device="cuda"), MAX_DEVICE_DIFFERENCE)
 
