@@ -52,7 +52,7 @@ every: .venv/.stamp
 results: .venv/.stamp
 	$(BIN)/python -m fhash_bench.results
 
-# libfhash, shared and static, its header, fhash.pc and CMake's files below build/lib (docs/c-library.md). Needs cmake.
+# libfhash, shared and static, its header, fhash.pc and CMake's files below build/lib (docs/howto/c-library.md). Needs cmake.
 lib:
 	cmake -S formats/fhash_formats/native -B build/cmake -DCMAKE_INSTALL_PREFIX=$(CURDIR)/build/lib -DCMAKE_INSTALL_LIBDIR=lib
 	cmake --build build/cmake --parallel 2
@@ -62,7 +62,7 @@ lib:
 paraview: .venv/.stamp
 	FHASH_PARAVIEW=$(CURDIR)/build/paraview $(BIN)/python -m pytest -rs tests/codec/views/test_vtk.py
 
-# Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/gpu.md): 7 minutes.
+# Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/howto/gpu.md): 7 minutes.
 device:
 	$(PYTHON) setup.py -q build_ext --inplace
 	$(PYTHON) tests/device/run.py build/device

@@ -71,7 +71,7 @@ def encode(
     client: of a dask cluster (`dask.distributed.Client`), on whose workers the series is coded.
         The file is that of this function without `client` and with `timings=False`, byte for byte.
         The source is a file that all workers see, or an array of dask, labelled or not; the
-        promise is a bound of the error. See docs/scale.md.
+        promise is a bound of the error.
 
     Returns the figures of the written file, and as "stages" what took the time. In the profile
     paper Ctrl-C during the training saves a checkpoint beside `path` and raises

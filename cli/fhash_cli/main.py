@@ -158,7 +158,7 @@ def program(context: click.Context) -> None:
     """A codec for time-varying volumes: keeps the features you name, reads any region at any time.
 
     Results go to stdout, messages and progress to stderr. With --json the result, or the error, is
-    one JSON object; docs/json.md describes it.
+    one JSON object, whose keys the documentation lists.
 
     \b
     Exit codes:

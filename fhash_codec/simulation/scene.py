@@ -212,7 +212,7 @@ class SimulatedScene(Record):
     paper_steps: int | None = limits(
         None, "steps of the paper's data set that it resembles", low=1, high=MAX_SIDE
     )
-    effects: tuple[Effect, ...] = limits((), "what happens, see docs/scenes.md")
+    effects: tuple[Effect, ...] = limits((), "what happens")
 
     def __post_init__(self) -> None:
         """Make the effects of their tables, and check every field; raises InputError."""

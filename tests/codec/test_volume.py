@@ -412,7 +412,7 @@ def url(path: Path, range_server) -> str:
 
 
 def test_requests_and_bytes(path, url, range_server) -> None:
-    """The limits that docs/remote.md promises."""
+    """The limits that docs/howto/remote.md promises."""
     with fhash_codec.open(path) as here, fhash_codec.open(url) as volume:
         assert here.container.size > 120_000
         assert here.chunks == (1, 16, 16, 16)

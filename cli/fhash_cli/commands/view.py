@@ -73,7 +73,7 @@ def view_command(
     """Show RUN.fhz in a browser: volume rendering, slices, time.
 
     A server of this machine alone gives the page and RUN.fhz, no other file, until Ctrl-C. The
-    browser decodes, and reads only what it shows. docs/view.md says more.
+    browser decodes, and reads only what it shows.
     """
     from fhash_codec.views.page import Page
     from fhash_codec.views.server import Server

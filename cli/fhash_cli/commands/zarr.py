@@ -221,8 +221,7 @@ def serve_command(run: str, port: int, host: str, origins: tuple[str, ...], as_j
 
     Clients see a Zarr v3 hierarchy without any codec of fhash: the values over the whole domain,
     coordinates, and levels of detail. Only the chunks that a client reads are decoded. Web pages
-    may read it where --origin names theirs. docs/zarr.md shows xarray, tensorstore, zarrita and
-    neuroglancer.
+    may read it where --origin names theirs.
     """
     from fhash_codec.views.server import Server
     from fhash_codec.views.view import opened_view
