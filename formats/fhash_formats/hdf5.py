@@ -1,7 +1,7 @@
 """The codec `fhash.transform` as a filter of HDF5: for h5py, h5netcdf, and xarray through it.
 
 Importing this module registers the filter with h5py, which is all that reading needs. Other
-programs that load HDF5 find it where `fhash hdf5-plugin-path` says. docs/howto/c-library.md shows the
+programs that load HDF5 find it where `fhash hdf5-plugin-path` says. The documentation shows the
 tools.
 """
 

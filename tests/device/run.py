@@ -1,4 +1,4 @@
-"""Figures that only a machine with a GPU can give: `make device`, or run.py FOLDER (docs/howto/gpu.md).
+"""Figures that only a machine with a GPU gives: `make device`, or run.py FOLDER (see the GPU page).
 
 It takes at most 7 minutes and needs no network; selftest needs zarr, for which wheels in a folder
 on PYTHONPATH will do. Each part is a process of its own with a limit in seconds, so that one that
