@@ -35,7 +35,7 @@ for _name, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.
     if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _usual)
 
-SLOW_ROOMS = ("fresh", "hard", "golden")
+SLOW_ROOMS = ("documents", "fresh", "hard", "golden")
 """Rooms of `tests` whose files take minutes: they run first, so that no process ends alone."""
 QUICK_HARD_FILES = ("test_names.py", "test_summary.py")
 """Files of the room `hard` that take no time."""
