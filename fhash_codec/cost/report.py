@@ -460,7 +460,7 @@ def page(report: CostReport) -> str:
     answer = "".join(_figure(panel) for panel in made if not panel.section)
     filled = {
         "title": escape(TITLE + report.series),
-        "conclusion": escape(conclusion(report)),
+        "conclusion": re.sub(r"--[\w-]+", r"<code>\g<0></code>", escape(conclusion(report))),
         "facts": escape(_facts(report)),
         "answer": answer + (_advice(report) if report.advice else ""),
         "tabs": "".join(_tab(name, report, made) for name in SECTIONS).replace(
