@@ -670,7 +670,7 @@ async def _inside_shards(
     import asyncio
 
     from zarr.abc.store import RangeByteRequest, SuffixByteRequest
-    from zarr.core.buffer import default_buffer_prototype
+    from zarr.buffer import default_buffer_prototype
 
     sharding: Any = array.metadata.codecs[0]  # type: ignore[union-attr]
     names = [str(codec.to_dict()["name"]) for codec in sharding.index_codecs]
@@ -678,7 +678,7 @@ async def _inside_shards(
         return None
     inner = tuple(n // c for n, c in zip(array.shards or (), array.chunks, strict=True))
     size = 16 * prod(inner) + 4
-    at_end = sharding.index_location.value == "end"
+    at_end = sharding.to_dict()["configuration"]["index_location"] == "end"
     part = SuffixByteRequest(size) if at_end else RangeByteRequest(0, size)
     found: list[tuple[int, ...]] = []
     listed = [tuple(shard) for shard in shards]
