@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.file_series import condense, inside_folder
+from fhash_formats.readers.file_series import condense, inside_folder, refusing
 from fhash_formats.readers.layout import Layout
 from fhash_formats.series import NotStored
 from fhash_formats.support.values import text_of
@@ -554,8 +554,9 @@ def zarr_parts(array: zarr.Array[Any]) -> StoredParts | None:
     """
     from zarr.core.sync import sync
 
-    shards = getattr(array, "shards", None)
-    outer = shards or array.chunks
+    with refusing(f"array {array.name}"):  # of chunks that differ in size
+        shards = getattr(array, "shards", None)
+        outer = shards or array.chunks
     counts = tuple(-(-length // chunk) for length, chunk in zip(array.shape, outer, strict=True))
     if not counts or prod(counts) == 0:
         return None

@@ -109,10 +109,7 @@ def _coding(array: zarr.Array[Any]) -> _Coding | str:
 
     if array.metadata.zarr_format != 3:
         return "is of Zarr format 2"
-    try:
-        shard, chunk = array.shards, array.chunks
-    except NotImplementedError:
-        return "has no regular grid of chunks"
+    shard, chunk = array.shards, array.chunks
     codecs: list[Any] = list(array.metadata.codecs)
     at_end = True
     if shard is not None:
