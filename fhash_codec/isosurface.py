@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -91,12 +92,15 @@ def _zero_surface(
     if not scale:
         return nothing
     try:
-        points, triangles, *_ = marching_cubes(
-            (above / scale).astype(np.float32),
-            0.0,
-            mask=_last_vertices_of_cells(finite),
-            allow_degenerate=False,
-        )
+        with warnings.catch_warnings():
+            # scikit-image up to 0.26 sets shapes, which NumPy 2.5 deprecates
+            warnings.simplefilter("ignore", DeprecationWarning)
+            points, triangles, *_ = marching_cubes(
+                (above / scale).astype(np.float32),
+                0.0,
+                mask=_last_vertices_of_cells(finite),
+                allow_degenerate=False,
+            )
     except (RuntimeError, ValueError):  # raised by the library for a surface that is empty
         return nothing
     return points.astype(np.float64), triangles.astype(np.int64)

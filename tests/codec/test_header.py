@@ -339,7 +339,7 @@ def test_years_before_the_first_are_those_of_cftime() -> None:
 @pytest.mark.parametrize(
     ("time", "message"),
     [
-        (np.datetime64("NaT"), "'NaT' is no date"),
+        (np.datetime64("NaT", "s"), "'NaT' is no date"),
         (None, "None is no time; give a number or a date"),
         ([1, 2], r"\[1, 2\] is no time"),
     ],

@@ -295,7 +295,7 @@ SCALARS = st.one_of(
     st.binary(max_size=6),
     st.none(),
     st.booleans(),
-    st.just(np.datetime64("NaT")),
+    st.just(np.datetime64("NaT", "s")),
     st.just(np.zeros(1, "i4,f4")),
     st.builds(object),
 )

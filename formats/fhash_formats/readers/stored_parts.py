@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.file_series import condense, inside_folder
+from fhash_formats.readers.file_series import condense, inside_folder, refusing
 from fhash_formats.readers.layout import Layout
 from fhash_formats.series import NotStored
 from fhash_formats.support.values import text_of
@@ -554,8 +554,9 @@ def zarr_parts(array: zarr.Array[Any]) -> StoredParts | None:
     """
     from zarr.core.sync import sync
 
-    shards = getattr(array, "shards", None)
-    outer = shards or array.chunks
+    with refusing(f"array {array.name}"):  # of chunks that differ in size
+        shards = getattr(array, "shards", None)
+        outer = shards or array.chunks
     counts = tuple(-(-length // chunk) for length, chunk in zip(array.shape, outer, strict=True))
     if not counts or prod(counts) == 0:
         return None
@@ -670,7 +671,7 @@ async def _inside_shards(
     import asyncio
 
     from zarr.abc.store import RangeByteRequest, SuffixByteRequest
-    from zarr.core.buffer import default_buffer_prototype
+    from zarr.buffer import default_buffer_prototype
 
     sharding: Any = array.metadata.codecs[0]  # type: ignore[union-attr]
     names = [str(codec.to_dict()["name"]) for codec in sharding.index_codecs]
@@ -678,7 +679,7 @@ async def _inside_shards(
         return None
     inner = tuple(n // c for n, c in zip(array.shards or (), array.chunks, strict=True))
     size = 16 * prod(inner) + 4
-    at_end = sharding.index_location.value == "end"
+    at_end = sharding.to_dict()["configuration"]["index_location"] == "end"
     part = SuffixByteRequest(size) if at_end else RangeByteRequest(0, size)
     found: list[tuple[int, ...]] = []
     listed = [tuple(shard) for shard in shards]

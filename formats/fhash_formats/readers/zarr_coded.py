@@ -100,8 +100,7 @@ class _Coding:
 def _coding(array: zarr.Array[Any]) -> _Coding | str:
     """The codecs of an array, or why its chunks cannot be tiles."""
     from zarr.abc.codec import ArrayArrayCodec
-    from zarr.codecs import ShardingCodec, TransposeCodec
-    from zarr.core.chunk_grids import RegularChunkGrid
+    from zarr.codecs import TransposeCodec
 
     from fhash_formats.transform.zarr_codec import TransformCodec
 
@@ -110,18 +109,16 @@ def _coding(array: zarr.Array[Any]) -> _Coding | str:
 
     if array.metadata.zarr_format != 3:
         return "is of Zarr format 2"
-    if not isinstance(array.metadata.chunk_grid, RegularChunkGrid):
-        return "has no regular grid of chunks"
-    chunk = tuple(array.metadata.chunk_grid.chunk_shape)
+    shard, chunk = array.shards, array.chunks
     codecs: list[Any] = list(array.metadata.codecs)
-    shard, at_end = None, True
-    if len(codecs) == 1 and isinstance(codecs[0], ShardingCodec):
+    at_end = True
+    if shard is not None:
         sharding = codecs[0]
         names = named(sharding.index_codecs)
         if names != ["bytes", "crc32c"]:
             return f"has shards whose index is coded by {', '.join(names)}"
-        shard, chunk, codecs = chunk, tuple(sharding.chunk_shape), list(sharding.codecs)
-        at_end = sharding.index_location.value == "end"
+        codecs = list(sharding.codecs)
+        at_end = sharding.to_dict()["configuration"]["index_location"] == "end"
     told = f"is coded by {', '.join(named(codecs))}"
     order = list(range(len(chunk)))
     while codecs and isinstance(codecs[0], ArrayArrayCodec):
@@ -319,7 +316,7 @@ class CodedArray:
 
     def _read(self, place: Place, part: Any = None) -> bytes | None:
         """The bytes of a member of the store, or a part of them; None where it is not there."""
-        from zarr.core.buffer import default_buffer_prototype
+        from zarr.buffer import default_buffer_prototype
         from zarr.core.sync import sync
 
         key = self._array.metadata.encode_chunk_key(place)
@@ -329,12 +326,19 @@ class CodedArray:
 
     def _undone(self, place: Place, data: bytes) -> bytes:
         """The bytes of a chunk before the codecs that came after `fhash.transform`."""
-        from zarr.core.buffer import default_buffer_prototype
+        from zarr.buffer import default_buffer_prototype
+        from zarr.core.array_spec import ArraySpec
         from zarr.core.sync import sync
 
         prototype = default_buffer_prototype()
-        metadata, config = self._array.metadata, self._array._async_array.config
-        spec = metadata.get_chunk_spec(place, config, prototype)
+        array = self._array
+        spec = ArraySpec(
+            self._coding.chunk,
+            array.metadata.dtype,
+            array.fill_value,
+            array.async_array.config,
+            prototype,
+        )
 
         async def undo() -> Any:
             buffer: Any = prototype.buffer.from_bytes(data)

@@ -93,13 +93,13 @@ def open_arrays(
     for node in nodes:
         try:
             opened = zarr.open(store=store, path=f"{inside}/{node}".strip("/"), mode="r")
+            if isinstance(opened, zarr.Array):
+                _ = opened.shards or opened.chunks  # refused where their grid is not regular
+                arrays[node] = opened
+            else:
+                groups[node] = dict(opened.attrs)
         except Exception as error:  # codecs, types and JSON raise all kinds
             failed[node] = condense(error)
-            continue
-        if isinstance(opened, zarr.Array):
-            arrays[node] = opened
-        else:
-            groups[node] = dict(opened.attrs)
     return arrays, groups, failed
 
 

@@ -43,9 +43,8 @@ from fhash_formats.transform.tile import (
 from fhash_formats.transform.tile_format import TileSettings
 
 if TYPE_CHECKING:
+    from zarr.abc.buffer import Buffer, NDBuffer
     from zarr.core.array_spec import ArraySpec
-    from zarr.core.buffer import Buffer, NDBuffer
-    from zarr.core.chunk_grids import ChunkGrid
     from zarr.core.common import JSON
     from zarr.core.dtype.wrapper import TBaseDType, TBaseScalar, ZDType
 
@@ -150,7 +149,7 @@ class TransformCodec(ArrayBytesCodec):
         *,
         shape: tuple[int, ...],
         dtype: ZDType[TBaseDType, TBaseScalar],
-        chunk_grid: ChunkGrid,
+        chunk_grid: Any,
     ) -> None:
         """Raises InputError for a type that is not coded, and for axes of another array."""
         supported(dtype.to_native_dtype())

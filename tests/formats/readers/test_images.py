@@ -413,6 +413,7 @@ def test_damaged_compressed_values_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "ascii"])
 @pytest.mark.parametrize("suffix", [".nrrd", ".nhdr"])
+@pytest.mark.filterwarnings("ignore:datetime.datetime.utcnow")  # of pynrrd
 def test_files_of_pynrrd(tmp_path: Path, suffix: str, encoding: str) -> None:
     nrrd = pytest.importorskip("nrrd")
     path = tmp_path / f"a{suffix}"

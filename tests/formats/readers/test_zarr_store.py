@@ -104,6 +104,21 @@ def test_shards(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), VALUES)
 
 
+def test_an_array_of_unequal_chunks_bars_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    for name in ("u", "v"):
+        create_zarr(path, VALUES, name=name, chunks=(2, 3, 5, 6))
+    document = path / "u" / "zarr.json"
+    unequal = {"kind": "inline", "chunk_shapes": [[1, 3], [3], [5], [6]]}
+    told = json.loads(document.read_text())
+    told["chunk_grid"] = {"name": "rectilinear", "configuration": unequal}
+    document.write_text(json.dumps(told))
+    with zarr.config.set({"array.rectilinear_chunks": True}):  # newer versions ask for it
+        np.testing.assert_array_equal(frames(path, var="v"), VALUES)
+        with pytest.raises(InputError, match=r"cannot be opened: .*(?i:chunk.grid)"):
+            frames(path, var="u")
+
+
 @pytest.mark.parametrize("inside", ["", "run.zarr/"])
 @pytest.mark.parametrize("zarr_format", [2, 3])
 def test_a_zipped_group(tmp_path: Path, inside: str, zarr_format: int) -> None:
