@@ -330,15 +330,9 @@ class CodedArray:
         from zarr.core.array_spec import ArraySpec
         from zarr.core.sync import sync
 
-        prototype = default_buffer_prototype()
-        array = self._array
-        spec = ArraySpec(
-            self._coding.chunk,
-            array.metadata.dtype,
-            array.fill_value,
-            array.async_array.config,
-            prototype,
-        )
+        prototype, array = default_buffer_prototype(), self._array
+        dtype, config = array.metadata.dtype, array.async_array.config
+        spec = ArraySpec(self._coding.chunk, dtype, array.fill_value, config, prototype)
 
         async def undo() -> Any:
             buffer: Any = prototype.buffer.from_bytes(data)
