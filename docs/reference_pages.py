@@ -13,15 +13,13 @@ from pathlib import Path
 
 import click
 import schemas
+from schemas import table
 
 from fhash_cli.main import COMMANDS, program
-from fhash_cli.options import GROUPS, LAST, group_of
-
-DISTRIBUTED = "bench"
-"""The command whose subcommands come from the package fhash-bench."""
+from fhash_cli.options import BaseCommand
 
 
-def commands() -> Iterator[tuple[str, click.Command]]:
+def commands() -> Iterator[tuple[str, BaseCommand]]:
     """Every command that does work, by the words that call it."""
     for name in COMMANDS:
         command = program.get_command(click.Context(program), name)
@@ -37,34 +35,13 @@ def commands() -> Iterator[tuple[str, click.Command]]:
 
 def _cell(text: str) -> str:
     """A text as a cell of a table in Markdown."""
-    escaped = re.sub(r"([\\|<>*_\[\]{}$])", r"\\\1", text)
+    escaped = re.sub(r"([\\|<>*_\[\]{}$])", r"\\\1", " ".join(text.split()))
     return re.sub(r"(?<!\w)(\\-\\-|--)([a-z][a-z-]*)", r"`--\2`", escaped)
 
 
 def _code(text: str) -> str:
     """A text as code in a cell of a table."""
     return "`" + text.replace("|", "\\|") + "`"
-
-
-def _record(option: click.Option, context: click.Context) -> tuple[str, str]:
-    """The option as it is typed, and its help with default and range."""
-    record = option.get_help_record(context)
-    assert record is not None
-    return record[0], " ".join(record[1].split())
-
-
-def _options(name: str, command: click.Command) -> Iterator[tuple[str, str, str]]:
-    """Groups, forms and helps of the options of a command, in the order of its help."""
-    context = click.Context(command, info_name=name)
-    found = [
-        (group_of(command.name or "", option), *_record(option, context))
-        for option in command.get_params(context)
-        if isinstance(option, click.Option) and not option.hidden
-    ]
-    groups = [*(group for group in dict.fromkeys((*GROUPS, *(row[0] for row in found))))]
-    groups = [group for group in groups if group not in LAST] + list(LAST)
-    for group in groups:
-        yield from (row for row in found if row[0] == group)
 
 
 def _prose(command: click.Command) -> str:
@@ -82,11 +59,6 @@ def _prose(command: click.Command) -> str:
     return "\n\n".join(made)
 
 
-def _table(rows: Iterator[tuple[str, ...]] | list[tuple[str, ...]], *titles: str) -> str:
-    lines = [titles, tuple("---" for _ in titles), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def command_page() -> str:
     """Every command: its usage, its help, and its options by purpose."""
     parts = [
@@ -97,10 +69,9 @@ def command_page() -> str:
         context = click.Context(command, info_name=f"fhash {name}")
         usage = " ".join(command.collect_usage_pieces(context))
         parts += [f"## fhash {name}", f"```text\nfhash {name} {usage}\n```", _prose(command)]
-        rows = list(_options(name, command))
-        for group in dict.fromkeys(row[0] for row in rows):
-            cells = [(_code(form), _cell(text)) for title, form, text in rows if title == group]
-            parts.append(_table(cells, group, ""))
+        for group, records in command.grouped(context).items():
+            cells = [(_code(form), _cell(text)) for form, text in records]
+            parts.append(table(cells, group, ""))
     return "\n\n".join(parts) + "\n"
 
 
@@ -108,8 +79,9 @@ def option_page() -> str:
     """All options of all commands, by name, with the commands that have them."""
     found: dict[tuple[str, str], list[str]] = {}
     for name, command in commands():
-        for _, form, text in _options(name, command):
-            found.setdefault((form, text), []).append(name)
+        for records in command.grouped(click.Context(command, info_name=name)).values():
+            for record in records:
+                found.setdefault(record, []).append(name)
     everywhere = len(list(commands()))
     rows = [
         (
@@ -123,7 +95,7 @@ def option_page() -> str:
     ]
     return (
         "# All options\n\nMade from the program. An option that means something else in another"
-        f" command stands there twice.\n\n{_table(rows, 'option', 'commands', 'meaning')}\n"
+        f" command stands there twice.\n\n{table(rows, 'option', 'commands', 'meaning')}\n"
     )
 
 

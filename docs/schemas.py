@@ -126,14 +126,20 @@ def keys(schema: Schema, place: str = "") -> Iterator[tuple[str, Schema]]:
 
 def markdown(schema: Schema) -> str:
     """The description of a schema, and a table of its keys."""
-    head = [schema["description"], "", "| key | type | meaning |", "|---|---|---|"]
-    rows = [f"| `{key}` | {_words(inner)} | {_meaning(inner)} |" for key, inner in keys(schema)]
+    head = [schema["description"], ""]
+    rows = [(f"`{key}`", _words(inner), _meaning(inner)) for key, inner in keys(schema)]
     effects = schema["properties"].get("effects", {}).get("items", {}).get("oneOf", ())
     names = [each["properties"]["effect"]["const"] for each in effects]
     more = [
         f"\n### `{name}`\n\n{markdown(each)}" for name, each in zip(names, effects, strict=True)
     ]
-    return "\n".join([*head, *rows, *more])
+    return "\n".join([*head, table(rows, "key", "type", "meaning"), *more])
+
+
+def table(rows: Sequence[tuple[str, ...]], *titles: str) -> str:
+    """A table in Markdown."""
+    lines = [titles, tuple("---" for _ in titles), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def _words(schema: Schema, many: str = "") -> str:
@@ -226,7 +232,7 @@ def _description(text: str | None, schema: Schema) -> Schema:
 
 
 def _attributes(record: Any) -> dict[str, str]:
-    """What the docstring of a class says of its attributes, `name, other: text`, by name."""
+    """Texts on the attributes in the docstring of a class, `name, other: text`, by name."""
     text = " ".join(record.__doc__.partition("Attributes:")[2].split()).replace("None", "null")
     names = "|".join(record.__annotations__)
     _, *parts = re.split(rf"(?:^|(?<=\. ))((?:(?:{names}), )*(?:{names})): ", text)

@@ -7,6 +7,7 @@ one place to read and to change.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -370,3 +371,21 @@ class EncodeConfig(Record):
         if len(promised) > 1 and not {field.name for field in promised} <= set(PAIR):
             names = " and ".join(map(self.label, promised))
             raise InputError(f"{names} are given; promise one of them")
+
+
+def options_beyond(
+    values: Mapping[str, Any], defaults: Mapping[str, Any]
+) -> Iterator[tuple[str, Any]]:
+    """Options of the command line, each with its value, for settings other than the defaults.
+
+    A list is one option for each of its values; one that is on or off has the value None.
+    """
+    for setting in dataclasses.fields(EncodeConfig):
+        flag, value = EncodeConfig.label(setting), values.get(setting.name)
+        if value is None or value == defaults.get(setting.name):
+            continue
+        if isinstance(value, bool):
+            yield f"--{flag}" if value else f"--no-{flag}", None
+            continue
+        for each in value if isinstance(value, list | tuple) else [value]:
+            yield f"--{flag}", each

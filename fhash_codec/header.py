@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from math import prod
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import EncodeConfig, options_beyond
 from fhash_codec.features.occupancy import write_bits
 from fhash_codec.measure.metrics import even_steps
 from fhash_codec.measure.value_range import ValueRange
@@ -148,18 +148,10 @@ def _options(header: Mapping[str, Any]) -> list[str]:
     """The settings other than the defaults, as options of the command line."""
     config, profile = header.get("config", {}), header["model"]["profile"]
     defaults = EncodeConfig(profile=profile).to_dict() | {"profile": CONFIG_DEFAULTS["profile"]}
-    words = []
-    for setting in fields(EncodeConfig):
-        name, flag = setting.name, EncodeConfig.label(setting)
-        value = config.get(name)
-        if value is None or value == defaults.get(name):
-            continue
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-            continue
-        for each in value if isinstance(value, list | tuple) else [value]:
-            words.append(f"--{flag} {str(each)[:MAX_OPTION]}")
-    return words
+    return [
+        option if value is None else f"{option} {str(value)[:MAX_OPTION]}"
+        for option, value in options_beyond(config, defaults)
+    ]
 
 
 MAX_LISTED = 512

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from blocks import blocks
 from click.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -181,12 +182,10 @@ def test_documents_name_paths_that_exist(document: str) -> None:
 
 
 def readme_commands() -> list[str]:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```\w*\n(.*?)```", text, flags=re.DOTALL)
     lines = [
         line.strip().removeprefix("$ ")
-        for block in blocks
-        for line in block.replace("\\\n", " ").splitlines()
+        for block in blocks(ROOT / "README.md")
+        for line in block.text.replace("\\\n", " ").splitlines()
     ]
     return [line for line in lines if line.startswith("fhash ")]
 

@@ -26,8 +26,9 @@ MARK = re.compile(r"<!-- result: ([\w-]+)(?:\.([\w-]+))? -->(.*?)<!-- end -->", 
 
 
 def pages() -> list[Path]:
-    """README.md and every page of docs/."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    """README.md, and every page of docs/ but those that are made."""
+    written = (page for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "made")
+    return [ROOT / "README.md", *sorted(written)]
 
 
 def filled(text: str) -> str:

@@ -11,8 +11,8 @@ import pytest
 from fhash_bench import results
 from fhash_bench.results import MARK, RESULTS, ROOT, filled, pages
 
-OTHERS = ("stability.md", "gallery.md", "json.md", "scenes.md")
-"""Pages that other programs write, and those with tables of keys and settings."""
+OTHERS = ("stability.md", "gallery.md", "json.md")
+"""Pages that other programs write, and that with the table of exit codes."""
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 FIGURE = re.compile(r"[-+<~]?\d")
 

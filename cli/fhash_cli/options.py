@@ -279,19 +279,22 @@ class BaseCommand(click.Command):
                     _check_repeated(option, ctx)
         return super().parse_args(ctx, args)
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The options of the help, in their groups."""
+    def grouped(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
+        """Options as they are typed, and their helps, by the titles of groups in their order."""
         rows: dict[str, list[tuple[str, str]]] = {}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is not None and isinstance(parameter, click.Option):
                 title = group_of(self.name or "", parameter)
                 rows.setdefault(title, []).append(record)
-        last = [title for title in LAST if title in rows]
-        first = [title for title in dict.fromkeys((*GROUPS, *rows)) if title in rows]
-        for title in [title for title in first if title not in last] + last:
+        first = [title for title in dict.fromkeys((*GROUPS, *rows)) if title not in LAST]
+        return {title: rows[title] for title in (*first, *LAST) if title in rows}
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The options of the help, in their groups."""
+        for title, records in self.grouped(ctx).items():
             with formatter.section(title):
-                formatter.write_dl(rows[title])
+                formatter.write_dl(records)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The lines of `epilog` as examples, as they are typed, and the exit codes."""

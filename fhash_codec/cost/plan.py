@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import EncodeConfig, options_beyond
 from fhash_codec.cost.results import DEFAULT, NETWORK, LeftOut
 from fhash_codec.features.features import Extent
 from fhash_codec.features.selection import select_features
@@ -293,18 +292,11 @@ class Wish:
 def options_of(config: EncodeConfig) -> str:
     """Options of `fhash encode` that give settings, for a shell; empty for the defaults."""
     words = []
-    for field in dataclasses.fields(config):
-        name, value = EncodeConfig.label(field), getattr(config, field.name)
-        if value == field.default:
-            continue
-        if isinstance(value, bool):
-            words.append(f"--{'' if value else 'no-'}{name}")
-            continue
-        for each in value if isinstance(value, tuple) else (value,):
-            text = f"{each:.12g}" if isinstance(each, float) else f"{each}"
-            # The name that the options of the command line are listed with.
-            text = "network" if name == "profile" else text
-            words += [f"--{name}", shlex.quote(text)]
+    for option, value in options_beyond(vars(config), vars(EncodeConfig())):
+        text = f"{value:.12g}" if isinstance(value, float) else f"{value}"
+        # The name that the options of the command line are listed with.
+        text = "network" if option == "--profile" else text
+        words += [option] if value is None else [option, shlex.quote(text)]
     return " ".join(words)
 
 

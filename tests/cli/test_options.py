@@ -6,7 +6,6 @@ import dataclasses
 import json
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -18,6 +17,7 @@ import pytest
 import xarray
 from click.testing import CliRunner
 from command_line import Fhash, Refused
+from reference_pages import commands
 
 import fhash_codec
 from fhash_cli.commands.encode import command as encode
@@ -38,6 +38,8 @@ from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
 
 WHOLE = (None, None)
+ALL = tuple(command for _, command in commands())
+"""Every command, with those of the benches."""
 LATTICE = np.arange(4 * 5 * 6).reshape(4, 5, 6)
 
 
@@ -127,17 +129,6 @@ def test_what_is_no_time_is_refused(text: str) -> None:
         DURATION.convert(text, None, None)
 
 
-def commands() -> Iterator[click.Command]:
-    """Every command, with those of the benches."""
-    for name in COMMANDS:
-        command = program.get_command(click.Context(program), name)
-        assert command is not None
-        if isinstance(command, click.Group):
-            yield from command.commands.values()
-        else:
-            yield command
-
-
 def sections(fhash: Fhash, command: str) -> dict[str, str]:
     """The help of a command by the headings of its groups."""
     text = fhash(*command.split(), "--help").stdout
@@ -145,7 +136,7 @@ def sections(fhash: Fhash, command: str) -> dict[str, str]:
     return {title.strip(): rows for title, _, rows in parts if rows.startswith("  -")}
 
 
-@pytest.mark.parametrize("command", tuple(commands()), ids=lambda command: str(command.name))
+@pytest.mark.parametrize("command", ALL, ids=lambda command: str(command.name))
 def test_every_command_is_of_this_kind_and_names_each_option_once(command: click.Command) -> None:
     assert isinstance(command, BaseCommand)
     with click.Context(command) as context:
@@ -162,7 +153,7 @@ def test_every_command_is_of_this_kind_and_names_each_option_once(command: click
     assert sorted(lines) == sorted(min(option.opts, key=len) for option in options)
 
 
-@pytest.mark.parametrize("command", tuple(commands()), ids=lambda command: str(command.name))
+@pytest.mark.parametrize("command", ALL, ids=lambda command: str(command.name))
 def test_help_has_examples_that_are_commands(fhash: Fhash, command: click.Command) -> None:
     lines = (command.epilog or "").splitlines()
     assert any(f"fhash {command.name}" in line.replace("bench ", "") for line in lines)

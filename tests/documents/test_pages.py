@@ -14,24 +14,21 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
-import click
 import pytest
+from blocks import blocks
 from click.testing import CliRunner
+from json_schemas import DOCS
+from reference_pages import commands
 
 import fhash_codec
-from fhash_cli.main import program
+from fhash_bench.results import pages
+from fhash_cli.main import COMMANDS, program
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted(
-    path
-    for path in (ROOT / "docs").rglob("*.md")
-    if "made" not in path.parts and path.name not in ("gallery.md", "stability.md")
-)
+PAGES = [page for page in pages()[1:] if page.name not in ("gallery.md", "stability.md")]
 """Pages of the site, but those that `fhash demo --gallery` and `make hard` write."""
-NOTEBOOKS = sorted((ROOT / "docs").rglob("*.ipynb"))
+NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
 RUN = ("sh", "python")
 SHOWN = ("text", "toml", "c", "js", "xml", "json", "fortran", "cmake")
 """Languages of blocks that nobody runs: outputs, files, and code of other languages."""
@@ -44,25 +41,8 @@ LONG = re.compile(r"fhash demo$| --ratio | --feature ")
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*\.?\d*(?:e-?\d+)?")
 
 
-@dataclass(frozen=True)
-class Block:
-    """A fenced block: its language, text, and the line of the page where it begins."""
-
-    language: str
-    text: str
-    line: int
-
-
-def blocks(page: Path) -> list[Block]:
-    text = page.read_text(encoding="utf-8")
-    return [
-        Block(match[1], match[2], text[: match.start()].count("\n") + 1)
-        for match in re.finditer(r"^```(\S*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
-    ]
-
-
 def named(path: Path) -> str:
-    return path.relative_to(ROOT / "docs").as_posix()
+    return path.relative_to(DOCS).as_posix()
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +64,7 @@ def folder(
 ) -> Path:
     if "first-hour" not in request.node.name:  # begins from nothing
         shutil.copytree(demo, tmp_path, dirs_exist_ok=True)
-    shutil.copytree(ROOT / "docs" / "examples", tmp_path / "examples")
+    shutil.copytree(DOCS / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -181,8 +161,8 @@ def check_options(text: str, place: str) -> None:
 def test_examples_of_the_help_run(folder: Path) -> None:
     epilogs = {
         name: (command.epilog or "").splitlines()
-        for name in program.list_commands(click.Context(program))
-        if (command := program.get_command(click.Context(program), name)) and name not in ENDLESS
+        for name, command in commands()
+        if name.split()[0] not in ENDLESS
     }
     assert sum(map(len, epilogs.values())) > 20
     for lines in epilogs.values():
@@ -214,7 +194,7 @@ def test_a_notebook_has_its_outputs() -> None:
 
 
 def test_each_public_name_has_an_example_that_runs() -> None:
-    page = ROOT / "docs" / "reference" / "api.md"
+    page = DOCS / "reference" / "api.md"
     code = "".join(block.text for block in blocks(page) if block.language == "python")
     used = set(re.findall(r"fhash_codec\.(\w+)", code))
     assert set(fhash_codec.__all__) <= used
@@ -224,9 +204,5 @@ def test_each_public_name_has_an_example_that_runs() -> None:
 
 def test_each_command_is_in_an_example_that_runs() -> None:
     text = "".join(b.text for page in PAGES for b in blocks(page) if b.language in RUN)
-    unseen = {
-        name
-        for name in program.list_commands(click.Context(program))
-        if not re.search(rf"\bfhash {name}\b", text)
-    }
+    unseen = {name for name in COMMANDS if not re.search(rf"\bfhash {name}\b", text)}
     assert unseen <= {"paraview", "serve"}, unseen  # a window, and a server that Ctrl-C ends

@@ -5,31 +5,16 @@ from __future__ import annotations
 import re
 import shlex
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from blocks import Block, blocks
 from fresh_install import fhash, run
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = blocks(ROOT / "README.md")
 MAX_LINES = 120
-
-
-@dataclass(frozen=True)
-class Block:
-    """A code block: its language, text, and the line of the README where it begins."""
-
-    language: str
-    text: str
-    line: int
-
-
-def blocks() -> list[Block]:
-    return [
-        Block(match[1], match[2], README[: match.start()].count("\n") + 1)
-        for match in re.finditer(r"```(\w*)\n(.*?)```", README, flags=re.DOTALL)
-    ]
 
 
 def commands(block: Block) -> list[list[str]]:
@@ -43,7 +28,7 @@ def test_the_readme_is_short() -> None:
 
 
 def test_every_block_is_python_or_commands() -> None:
-    assert {block.language for block in blocks()} == {"sh", "python"}
+    assert {block.language for block in BLOCKS} == {"sh", "python"}
 
 
 def test_installs_name_extras_that_exist() -> None:
@@ -66,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("reader")
 
 
-@pytest.mark.parametrize("block", blocks(), ids=lambda block: f"line {block.line}")
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: f"line {block.line}")
 def test_what_the_readme_shows_runs(block: Block, site: Path, folder: Path) -> None:
     if block.language == "python":
         result = run(site, folder, "-W", "error", "-c", block.text)
