@@ -10,28 +10,12 @@
 // transparency: 1 - 1e-9 is 1 in float32. Blocks are joined in float64, so that thin fog does not
 // vanish in rounding. The code is built for speed, not for the same bits everywhere: pictures agree
 // with those of fhash_codec/rendering/stream_march.py within rounding.
-#if defined(__GNUC__) && !defined(__clang__)
-// It makes branches of the loops below, and loops with branches are not vectorised.
-#pragma GCC optimize("no-tree-pre")
-#endif
+#define FHASH_MARCH fhash_march_v1
 #include "march_draw.hpp"
 
-namespace {
-
-FHASH_KERNEL(plain, 0)
-FHASH_KERNEL(shaded, SHADED)
-FHASH_KERNEL(lit, LIT)
-FHASH_KERNEL(shaded_lit, SHADED | LIT)
-FHASH_KERNEL(central, SHADED | CENTRAL)
-FHASH_KERNEL(central_lit, SHADED | CENTRAL | LIT)
-FHASH_KERNEL(maximum, MAXIMUM)
-
-}  // namespace
-
 // Add the rays of tiles first to stop (of 16 x 16 pixels, in rows) to the pictures of `march`,
-// which begin as zeros (depth: infinity). flags: SHADED, LIT, MAXIMUM, or those of
-// march_effects.cpp. counters, added to: rays, passes, samples, gradients, skips, evaluations.
-// Returns -1 for an input that cannot be.
+// which begin as zeros (depth: infinity). flags: what is drawn (march_packet.hpp). counters, added
+// to: rays, passes, samples, gradients, skips, evaluations. Returns -1 for an input that cannot be.
 FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t first,
                                  int64_t stop, int64_t* counters) {
     const FhashMarch& m = *march;
@@ -39,17 +23,13 @@ FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t
     if (m.entries < 2 || m.rays < 1 || !(m.step > 0)) return -1;
     if (m.cells && !m.distance) return -1;
     if (m.planes < 0 || m.planes > FHASH_PLANES) return -1;
-    if (flags & (MINIMUM | AVERAGE | ATTENUATED | GRADED))
-        return fhash_march_effect(m, flags, first, stop, counters);
-    Counters counted;
-    const bool differences = (flags & SHADED) && (m.central || m.smooth);
-    if (flags & MAXIMUM) maximum(m, first, stop, counted);
-    else if (differences && (flags & LIT)) central_lit(m, first, stop, counted);
-    else if (differences) central(m, first, stop, counted);
-    else if ((flags & SHADED) && (flags & LIT)) shaded_lit(m, first, stop, counted);
-    else if (flags & LIT) lit(m, first, stop, counted);
-    else if (flags & SHADED) shaded(m, first, stop, counted);
-    else plain(m, first, stop, counted);
-    counted.add_to(counters);
+    if ((flags & GRADED) && !m.grading) return -1;
+    FhashTiles* tiles = fhash_march_v1;
+#if defined(FHASH_TARGETS)
+    const unsigned has = fhash_instructions();
+    if (m.path < 2 && (has & FHASH_HAS_V3)) tiles = fhash_march_v3;
+    if (m.path < 1 && (has & FHASH_HAS_V4) && m.shape[2] > 1) tiles = fhash_march_v4;
+#endif
+    tiles(m, (int)flags, first, stop, counters);
     return 0;
 }

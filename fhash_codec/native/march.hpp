@@ -8,6 +8,7 @@
 #include <limits>
 
 #include "core.hpp"
+#include "target.hpp"
 
 constexpr int FHASH_SURFACES = 64;  // surfaces of a picture, at most
 constexpr int FHASH_POWERS = 1024;  // intervals of the table of highlights
@@ -88,6 +89,13 @@ extern "C" struct FhashMarch {
     double network_low, network_span;  // the value of its 0, and the change to that of its 1
     std::int64_t* network_status;      // takes what it returns where it fails
 };
+
+// `fhash_march` for a target.
+using FhashTiles = void(const FhashMarch& march, int flags, std::int64_t first, std::int64_t stop,
+                        std::int64_t* counters);
+FhashTiles fhash_march_v1, fhash_march_v3, fhash_march_v4;
+
+namespace {
 
 struct FhashCell {
     double value, gx, gy, gz;
@@ -199,3 +207,5 @@ inline void fhash_central(const FhashMarch& m, const float* values, double x, do
         if (difference == difference) *slopes[c] = difference;
     }
 }
+
+}  // namespace

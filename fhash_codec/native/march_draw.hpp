@@ -1,7 +1,11 @@
-// What rays make of their samples, and the kernels that march tiles. Shared by march.cpp and
-// march_effects.cpp.
+// What rays make of their samples, and the march through tiles. Compiled once for each target:
+// march.cpp, march_avx2.cpp, march_avx512.cpp.
 #pragma once
 
+#if defined(__GNUC__) && !defined(__clang__)
+// It makes branches of loops over rays, and loops with branches are not vectorised.
+#pragma GCC optimize("no-tree-pre")
+#endif
 #include "march.hpp"
 #include "march_grading.hpp"
 #include "march_network.hpp"
@@ -13,48 +17,40 @@
 #include "march_surfaces.hpp"
 #include "march_wide.hpp"
 
-// march_effects.cpp: `fhash_march` for the flags MINIMUM, AVERAGE, ATTENUATED and GRADED.
-std::int64_t fhash_march_effect(const FhashMarch& march, std::int64_t flags, std::int64_t first,
-                                std::int64_t stop, std::int64_t* counters);
-
 namespace {
 
 // Add the samples of a pass to the colours.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::composite(Counters& counted) {
-    const float* const table = m.table;
+template <bool SHADED_TOO, bool LIT_TOO> void Packet::composite(Counters& counted) {
+    [[maybe_unused]] const float* const table = m.table;
     int gradients = 0;
     #pragma omp simd reduction(+ : gradients)
     for (int l = 0; l < N; l++) {
         float red, green, blue;
-        if (FLAGS & WIDE) {
-            red = cr[l]; green = cg[l]; blue = cb[l];
-        } else {
-            const int t = 4 * (int)at[l];
-            const float share = at[l] - (int)at[l];
-            red = table[t] + share * (table[t + 4] - table[t]);
-            green = table[t + 1] + share * (table[t + 5] - table[t + 1]);
-            blue = table[t + 2] + share * (table[t + 6] - table[t + 2]);
-        }
+#if defined(FHASH_WIDE)
+        red = cr[l]; green = cg[l]; blue = cb[l];
+#else
+        const int t = 4 * (int)at[l];
+        const float share = at[l] - (int)at[l];
+        red = table[t] + share * (table[t + 4] - table[t]);
+        green = table[t + 1] + share * (table[t + 5] - table[t + 1]);
+        blue = table[t + 2] + share * (table[t + 6] - table[t + 2]);
+#endif
         float lamp = 1, around = 1;
-        if (FLAGS & LIT) {
+        if (LIT_TOO) {
             lamp = light_at(m, 0, px[l], py[l], pz[l]);
             around = light_at(m, 1, px[l], py[l], pz[l]);
         }
-        if (FLAGS & SHADED) {
+        if (SHADED_TOO) {
             const float x = gx[l], y = gy[l], z = gz[l], inverse = inverse_length(phong, x, y, z);
             const float towards = x * tox[l] + y * toy[l] + z * toz[l];
             const float halfway = x * hx[l] + y * hy[l] + z * hz[l];
-            float factor = phong.ambient * around + lamp * scattered(phong, towards, inverse);
-            float shine = lamp * mirrored(phong, halfway, inverse);
-            if (FLAGS & GRADED) {
-                factor = phong.unlit ? lamp * around : factor;
-                shine = phong.unlit ? 0.f : shine;
-            }
+            const float factor = phong.ambient * around + lamp * scattered(phong, towards, inverse);
+            const float shine = lamp * mirrored(phong, halfway, inverse);
             red = red * factor + shine;
             green = green * factor + shine;
             blue = blue * factor + shine;
-            if (!(FLAGS & GRADED)) gradients += alpha[l] > 0;
-        } else if (FLAGS & LIT) {
+            gradients += alpha[l] > 0;
+        } else if (LIT_TOO) {
             const float factor = lamp * around;
             red *= factor; green *= factor; blue *= factor;
         }
@@ -64,11 +60,11 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::composite(Counters& counte
         g[l] += w * green;
         b[l] += w * blue;
     }
-    counted.gradients += gradients;
+    if (!(flags & GRADED)) counted.gradients += gradients;  // `grade` has counted them
 }
 
 // Let every ray that is not at its end take part in the pass. Returns 3 if there is one, else 0.
-template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::alive() {
+FHASH_INLINE int Packet::alive() {
     int here = 0;
     #pragma omp simd reduction(| : here)
     for (int l = 0; l < N; l++) {
@@ -78,28 +74,41 @@ template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::alive() {
     return here ? 3 : 0;
 }
 
+// Take the samples of a pass.
+FHASH_INLINE void Packet::take(Counters& counted, Seen& seen) {
+    if (m.network) sample_network(counted, seen);
+    else if (flags & MAXIMUM) sample<LARGEST>(counted, seen);
+    else if (flags & SHADED) sample<GRADIENTS>(counted, seen);
+    else sample<OPACITIES>(counted, seen);
+}
+
 // Draw the samples of a pass, and the surfaces before them.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::show(Seen seen, Counters& counted) {
+FHASH_INLINE void Packet::show(Seen seen, Counters& counted) {
     if (seen.lost) {
         mend();
         seen.any = 1;
     }
-    if (FLAGS & (AVERAGE | ATTENUATED)) {
-        if (seen.any) project();
+    if (flags & (AVERAGE | ATTENUATED)) {
+        if (seen.any) flags & AVERAGE ? average() : attenuate();
         return;
     }
     if (seen.ending && seen.any) shorten();
     if (m.surfaces > 0) surfaces(counted);
     const float* const lit = m.smooth ? m.smooth : m.values;
-    if (seen.any && (FLAGS & GRADED)) {
+    if (seen.any && (flags & GRADED)) {
         // Opacity by the gradients of the values themselves.
         if (m.central) slopes(m.values);
         grade(counted);
         if (m.smooth && !m.unlit) slopes(m.smooth);
-    } else if (seen.any && (FLAGS & CENTRAL)) {
+    } else if (seen.any && (flags & SHADED) && (m.central || m.smooth)) {
         slopes(lit);
     }
-    if (seen.any) composite(counted);
+    if (!seen.any) {
+    } else if ((flags & SHADED) && !m.unlit) {
+        flags & LIT ? composite<true, true>(counted) : composite<true, false>(counted);
+    } else {
+        flags & LIT ? composite<false, true>(counted) : composite<false, false>(counted);
+    }
     if (m.surfaces > 0) finish(counted);
     if (m.depth && (seen.any || m.surfaces > 0))
         for (int l = 0; l < N; l++)
@@ -108,7 +117,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::show(Seen seen, Counters& 
 
 // End the rays behind which less than a share of the light is left. In two steps with a branch, so
 // that processors begin the next pass before this one's opacity is known.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::end_rays(float stop) {
+FHASH_INLINE void Packet::end_rays(float stop) {
     int ended = 0;
     #pragma omp simd reduction(| : ended)
     for (int l = 0; l < N; l++) ended |= (left[l] * (1 - a[l]) < stop) & (k[l] < count[l]);
@@ -119,8 +128,8 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::end_rays(float stop) {
 }
 
 // March the rays of the packet to their ends, pass by pass.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::march(Counters& counted) {
-    const bool skipping = FLAGS & MAXIMUM ? m.highest != nullptr : m.distance != nullptr;
+FHASH_INLINE void Packet::march(Counters& counted) {
+    const bool skipping = flags & MAXIMUM ? m.highest != nullptr : m.distance != nullptr;
     const float stop = max((float)m.threshold, 1e-37f);
     if (skipping && m.surfaces > 0) meet(counted);
     for (int since = 0;;) {
@@ -129,34 +138,28 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::march(Counters& counted) {
         if (!(state & 1)) continue;
         counted.passes++;
         Seen seen;
-        if (m.network) sample_network(counted, seen);
-        else
-#if defined(FHASH_AVX512)
-        if constexpr (FLAGS & WIDE) sample_wide(*this, counted, seen);
-        else
-#endif
-            sample(counted, seen);
-        if (FLAGS & MAXIMUM) {
+        take(counted, seen);
+        if (flags & MAXIMUM) {
             if (seen.lost) keep_lost_maximum();
         } else {
             show(seen, counted);
         }
         #pragma omp simd
         for (int l = 0; l < N; l++) k[l] += on[l];
-        if (FLAGS & MAXIMUM) continue;
+        if (flags & MAXIMUM) continue;
         if (++since == BLOCK) {
             since = 0;
             flush();
         }
-        if (FLAGS & ATTENUATED) end_attenuated();
-        else if (!(FLAGS & AVERAGE)) end_rays(stop);
+        if (flags & ATTENUATED) end_attenuated();
+        else if (!(flags & AVERAGE)) end_rays(stop);
     }
     flush();
-    if (FLAGS & PROJECTED) show_projection(counted);
+    if (flags & PROJECTED) show_projection(counted);
 }
 
 // Add the rays to the pictures, from this pixel on.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::write(int64_t x, int64_t y) {
+FHASH_INLINE void Packet::write(int64_t x, int64_t y) {
     const double share = 1.0 / (double)(m.rays * m.rays);
     alignas(64) float shares[N][4];
     #pragma omp simd
@@ -183,52 +186,25 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::write(int64_t x, int64_t y
     }
 }
 
-// March the packets of a tile.
-template <int FLAGS>
-FHASH_INLINE void march_tile(Packet<FLAGS>& packet, int64_t left, int64_t top, Counters& counted) {
-    const FhashMarch& m = packet.m;
-    for (int64_t y = top; y < min(top + TILE, m.height); y += SIDE)
-        for (int64_t x = left; x < min(left + TILE, m.width); x += SIDE)
-            for (int64_t ray = 0; ray < m.rays * m.rays; ray++) {
-                const int met = packet.aim(x, y, ray);
-                if (!met) continue;
-                counted.rays += met;
-                packet.march(counted);
-                packet.write(x, y);
-            }
-}
+}  // namespace
 
 // March the tiles from first to stop, in rows of the picture.
-template <int FLAGS>
-FHASH_INLINE void tiles(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {
-    const int64_t across = (m.width + TILE - 1) / TILE;
-    Packet<FLAGS> packet(m);
-    for (int64_t tile = first; tile < stop; tile++)
-        march_tile(packet, tile % across * TILE, tile / across * TILE, counted);
-}
-
-// A function for each set of flags, compiled for several machines; m.path says which of them.
-// FHASH_CLONES cannot be used: clones cannot be told that gathering from memory is quick on a
-// machine that has all of AVX-512.
-#define FHASH_PARAMETERS const FhashMarch &m, int64_t first, int64_t stop, Counters &counted
-#if defined(FHASH_AVX512)
-#define FHASH_KERNEL(NAME, FLAGS)                                                                  \
-    FHASH_AVX512 void NAME##_v4(FHASH_PARAMETERS) {                                                \
-        tiles<(FLAGS) | WIDE>(m, first, stop, counted);                                            \
-    }                                                                                              \
-    __attribute__((target("arch=x86-64-v3,tune=haswell"))) void NAME##_v3(FHASH_PARAMETERS) {      \
-        tiles<FLAGS>(m, first, stop, counted);                                                     \
-    }                                                                                              \
-    void NAME##_v1(FHASH_PARAMETERS) { tiles<FLAGS>(m, first, stop, counted); }                    \
-    void NAME(FHASH_PARAMETERS) {                                                                  \
-        const unsigned has = fhash_instructions();                                                 \
-        const bool v4 = m.path < 1 && (has & FHASH_HAS_V4) && m.shape[2] > 1;                      \
-        const bool v3 = m.path < 2 && (has & FHASH_HAS_V3);                                        \
-        (v4 ? NAME##_v4 : v3 ? NAME##_v3 : NAME##_v1)(m, first, stop, counted);                    \
+void FHASH_MARCH(const FhashMarch& m, int flags, std::int64_t first, std::int64_t stop,
+                 std::int64_t* counters) {
+    const std::int64_t across = (m.width + TILE - 1) / TILE;
+    Counters counted;
+    Packet packet(m, flags);
+    for (std::int64_t tile = first; tile < stop; tile++) {
+        const std::int64_t left = tile % across * TILE, top = tile / across * TILE;
+        for (std::int64_t y = top; y < min(top + TILE, m.height); y += SIDE)
+            for (std::int64_t x = left; x < min(left + TILE, m.width); x += SIDE)
+                for (std::int64_t ray = 0; ray < m.rays * m.rays; ray++) {
+                    const int met = packet.aim(x, y, ray);
+                    if (!met) continue;
+                    counted.rays += met;
+                    packet.march(counted);
+                    packet.write(x, y);
+                }
     }
-#else
-#define FHASH_KERNEL(NAME, FLAGS) \
-    FHASH_CLONES void NAME(FHASH_PARAMETERS) { tiles<FLAGS>(m, first, stop, counted); }
-#endif
-
-}  // namespace
+    counted.add_to(counters);
+}

@@ -21,7 +21,7 @@ FHASH_INLINE float opacity_of(float x) {
 }
 
 // Multiply the extinctions of a pass by the factors of their gradients.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::grade(Counters& counted) {
+void Packet::grade(Counters& counted) {
     const float* const factors = m.grading;
     const double* const extinctions = m.extinction;
     const float scale = (float)m.grade_scale, most = (float)FHASH_GRADES;

@@ -12,7 +12,7 @@ namespace {
 
 // Evaluate the network at the next samples of all rays, the nearest first, where the frame says
 // that there is a value.
-template <int FLAGS> void Packet<FLAGS>::look_ahead(Counters& counted) {
+void Packet::look_ahead(Counters& counted) {
     FhashPoints points;
     int ray[FHASH_POINTS], sample[FHASH_POINTS];
     for (int l = 0; l < N; l++) {
@@ -48,7 +48,7 @@ template <int FLAGS> void Packet<FLAGS>::look_ahead(Counters& counted) {
 }
 
 // `sample` for a network.
-template <int FLAGS> void Packet<FLAGS>::sample_network(Counters& counted, Seen& seen) {
+void Packet::sample_network(Counters& counted, Seen& seen) {
     const float top = (float)(m.entries - 1);
     const float least = (float)m.low, scale = (float)m.scale;
     int wanting = 0;
@@ -69,8 +69,8 @@ template <int FLAGS> void Packet<FLAGS>::sample_network(Counters& counted, Seen&
         const bool known = value[l] == value[l] && on[l];
         const float here = value[l] = known ? ahead[l][j] : NONE;
         seen.lost |= on[l] && !known;
-        if (FLAGS & MAXIMUM) {
-            const float ranked = FLAGS & MINIMUM ? -here : here;
+        if (flags & MAXIMUM) {
+            const float ranked = flags & MINIMUM ? -here : here;
             const bool better = on[l] && ranked > best[l];
             best[l] = better ? ranked : best[l];
             where[l] = better ? k[l] : where[l];
@@ -83,11 +83,11 @@ template <int FLAGS> void Packet<FLAGS>::sample_network(Counters& counted, Seen&
         seen.any |= alpha[l] > 0;
         gx[l] = gy[l] = gz[l] = 0;
     }
-    if ((FLAGS & SHADED) && seen.any && !m.central) slopes_of_network();
+    if ((flags & SHADED) && seen.any && !m.central) slopes_of_network();
 }
 
 // The gradients of a pass where it has an opacity: those of the network itself.
-template <int FLAGS> void Packet<FLAGS>::slopes_of_network() {
+void Packet::slopes_of_network() {
     FhashPoints points;
     int ray[N];
     for (int l = 0; l < N; l++) {
@@ -104,7 +104,7 @@ template <int FLAGS> void Packet<FLAGS>::slopes_of_network() {
 }
 
 // The same by central differences, as fhash_central does.
-template <int FLAGS> void Packet<FLAGS>::central_slopes_of_network() {
+void Packet::central_slopes_of_network() {
     float* const to[3] = {gx, gy, gz};
     bool lost[N] = {};
     for (int c = 0; c < 3; c++) {

@@ -1,5 +1,8 @@
-// A packet of 4 x 4 rays, and the light on what they meet. All march_*.hpp are parts of march.cpp
-// alone.
+// A packet of 4 x 4 rays, and the light on what they meet. All march_*.hpp are parts of
+// march_draw.hpp, which is compiled once for each target.
+//
+// What is drawn is decided by flags at run time, between the loops over rays. A loop over rays that
+// would compute more than is drawn is a template on what it is for.
 #pragma once
 
 #include "march.hpp"
@@ -31,13 +34,17 @@ constexpr int AHEAD = 16; // samples of a ray at which a network may be evaluate
 constexpr int SHADED = 1;    // the volume is lit by its gradients
 constexpr int LIT = 2;       // by what a light grid leaves of the light
 constexpr int MAXIMUM = 4;   // the largest value along each ray, instead of the volume
-constexpr int CENTRAL = 8;   // shaded by central differences
-constexpr int WIDE = 16;     // sampled by AVX-512, in frames of two columns or more
 constexpr int MINIMUM = 32;  // with MAXIMUM: of the values times -1
 constexpr int AVERAGE = 64;  // the mean along each ray, instead of the volume
 constexpr int ATTENUATED = 128;  // the largest value along each ray after what lies before it
 constexpr int GRADED = 256;      // with SHADED: the gradients decide on the opacity, too
 constexpr int PROJECTED = MAXIMUM | AVERAGE | ATTENUATED;
+
+// What a pass takes from its samples: values and opacities, these and the gradients, or the largest
+// value.
+enum Taken { OPACITIES, GRADIENTS, LARGEST };
+// By what rays leap: bricks that do not matter, these and cells, or bricks below the largest value.
+enum Leaps { BY_BRICKS, BY_CELLS, BY_LARGEST };
 
 const double ENDLESS = std::numeric_limits<double>::infinity();
 const float NONE = std::numeric_limits<float>::quiet_NaN();
@@ -76,11 +83,10 @@ FHASH_INLINE double opacity_of_share(double opacity, double share) {
 struct Phong {
     float ambient, diffuse, specular, steep;
     float floor;  // the square of that of the march
-    int unlit;
     const float* powers;
     explicit Phong(const FhashMarch& m)
         : ambient((float)m.ambient), diffuse((float)m.diffuse), specular((float)m.specular),
-          steep((float)m.steep), floor((float)(m.floor * m.floor)), unlit(m.unlit != 0),
+          steep((float)m.steep), floor((float)(m.floor * m.floor)),
           powers(m.powers) {}
 };
 
@@ -88,8 +94,9 @@ struct Lines;
 
 // 16 rays, and how far they are. In single precision what vectors work on, in double precision what
 // is worked on for single rays.
-template <int FLAGS> struct Packet {
+struct Packet {
     const FhashMarch& m;
+    const int flags;
     const Phong phong;
     // The lines of the rays.
     alignas(64) float ox[N], oy[N], oz[N];        // place of sample 0
@@ -111,7 +118,7 @@ template <int FLAGS> struct Packet {
     alignas(64) float px[N], py[N], pz[N];  // places
     alignas(64) float farthest[N];          // sample behind which none is taken, with planes
     alignas(64) float best[N];              // largest value so far
-    alignas(64) float cr[N], cg[N], cb[N];  // colours, where WIDE
+    alignas(64) float cr[N], cg[N], cb[N];  // colours, where sampled by AVX-512
     // Numbers of samples.
     alignas(64) int k[N];         // the next one
     alignas(64) int count[N];     // of all
@@ -134,8 +141,8 @@ template <int FLAGS> struct Packet {
     float low[3], high[3];  // the part of the frame that is seen, in which all samples lie
     const bool whole;       // whether the frame has values in all of the drawn box
 
-    explicit Packet(const FhashMarch& given)
-        : m(given), phong(given),
+    Packet(const FhashMarch& given, int drawn)
+        : m(given), flags(drawn), phong(given),
           whole(std::equal(&m.box[0][0], &m.box[0][0] + 6, &m.seen[0][0])) {
         for (int c = 0; c < 3; c++) {
             const double most = (double)m.shape[2 - c] - 1;
@@ -151,21 +158,21 @@ template <int FLAGS> struct Packet {
     FHASH_INLINE void point(Lines& lines, int left_most, int top_most, int64_t ray);
     FHASH_INLINE void cut(Lines& lines);
     FHASH_INLINE int count_samples(Lines& lines, int left_most, int top_most, int64_t ray);
-    FHASH_INLINE int keep_seen(const Lines& lines);
+    int keep_seen(const Lines& lines);
     FHASH_INLINE void place(const Lines& lines);
     FHASH_INLINE void reset();
-    FHASH_INLINE void aim_light(const Lines& lines);
+    void aim_light(const Lines& lines);
     // march_skip.hpp
     FHASH_INLINE int skip(Counters& counted);
-    template <bool CELLS> FHASH_INLINE int leap(Counters& counted);
+    template <Leaps BY> int leap(Counters& counted);
     bool visible(int l, double sample) const;
     void meet(Counters& counted);
     void part_ways(const int* leapt, Counters& counted);
     // march_sample.hpp
-    FHASH_INLINE void sample(Counters& counted, Seen& seen);
+    template <Taken KIND> void sample(Counters& counted, Seen& seen);
     void shorten();
     void mend();
-    FHASH_INLINE void slopes(const float* values);
+    void slopes(const float* values);
     void mend_slopes(const float* values);
     void mend_slope(int l, const float* values);
     FHASH_INLINE void look_up(int l);
@@ -176,23 +183,25 @@ template <int FLAGS> struct Packet {
     void central_slopes_of_network();
     // march_surfaces.hpp
     void see(int l, double sample, const FhashCell* cell, Counters& counted);
-    FHASH_INLINE double root(int l, double level, double to, double now, Counters& counted) const;
-    FHASH_INLINE void add_surface(int l, double sample, const double* surface, Counters& counted);
+    double root(int l, double level, double to, double now, Counters& counted) const;
+    void add_surface(int l, double sample, const double* surface, Counters& counted);
     void cross(int l, double to, double now, Counters& counted);
     void surfaces(Counters& counted);
     void finish(Counters& counted);
     // march_projections.hpp
-    FHASH_INLINE void keep_lost_maximum();
-    FHASH_INLINE void project();
+    void keep_lost_maximum();
+    void average();
+    void attenuate();
     FHASH_INLINE void end_attenuated();
-    FHASH_INLINE void show_value(int l, double entry, Counters& counted);
-    FHASH_INLINE void show_projection(Counters& counted);
+    void show_value(int l, double entry, Counters& counted);
+    void show_projection(Counters& counted);
     // march_grading.hpp
-    FHASH_INLINE void grade(Counters& counted);
+    void grade(Counters& counted);
     // march_draw.hpp
     FHASH_INLINE int alive();
+    FHASH_INLINE void take(Counters& counted, Seen& seen);
     FHASH_INLINE void show(Seen seen, Counters& counted);
-    FHASH_INLINE void composite(Counters& counted);
+    template <bool SHADED_TOO, bool LIT_TOO> void composite(Counters& counted);
     FHASH_INLINE void end_rays(float stop);
     FHASH_INLINE void march(Counters& counted);
     FHASH_INLINE void write(int64_t x, int64_t y);

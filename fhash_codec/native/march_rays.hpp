@@ -37,7 +37,7 @@ FHASH_INLINE void half_space(double distance, double approach, double& enter, do
 
 // Aim at the pixels x to x + SIDE, y to y + SIDE, by the ray of this number in each. Returns how
 // many rays meet the part of the box in which the frame has values.
-template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::aim(int64_t x, int64_t y, int64_t ray) {
+FHASH_INLINE int Packet::aim(int64_t x, int64_t y, int64_t ray) {
     Lines lines;
     point(lines, (int)x, (int)y, ray);
     cut(lines);
@@ -46,13 +46,12 @@ template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::aim(int64_t x, int64_t y, i
     if (!met) return 0;
     place(lines);
     reset();
-    if ((FLAGS & SHADED) || m.surfaces != 0) aim_light(lines);
+    if ((flags & SHADED) || m.surfaces != 0) aim_light(lines);
     return met;
 }
 
 // Origins and directions of rays through pixels.
-template <int FLAGS>
-FHASH_INLINE void Packet<FLAGS>::point(Lines& lines, int left_most, int top_most, int64_t ray) {
+FHASH_INLINE void Packet::point(Lines& lines, int left_most, int top_most, int64_t ray) {
     alignas(64) double u[N], w[N], length[N];
     const int width = (int)m.width, height = (int)m.height;
     const double right_of = (ray % m.rays + 0.5) / m.rays, below = (ray / m.rays + 0.5) / m.rays;
@@ -87,7 +86,7 @@ FHASH_INLINE void Packet<FLAGS>::point(Lines& lines, int left_most, int top_most
 }
 
 // Where rays enter and leave the drawn box and the part of it in which the frame has values.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::cut(Lines& lines) {
+FHASH_INLINE void Packet::cut(Lines& lines) {
     #pragma omp simd
     for (int l = 0; l < N; l++) {
         lines.enter[l] = lines.first[l] = 0;
@@ -118,8 +117,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::cut(Lines& lines) {
 }
 
 // The samples of rays in the drawn box. Returns how many rays have one.
-template <int FLAGS>
-FHASH_INLINE int Packet<FLAGS>::count_samples(Lines& lines, int left_most, int top_most,
+FHASH_INLINE int Packet::count_samples(Lines& lines, int left_most, int top_most,
                                               int64_t ray) {
     const int width = (int)m.width, height = (int)m.height;
     const uint32_t rays_of_pixel = (uint32_t)(m.rays * m.rays);
@@ -150,7 +148,7 @@ FHASH_INLINE int Packet<FLAGS>::count_samples(Lines& lines, int left_most, int t
 }
 
 // Keep those samples at which the frame has values. Returns how many rays have one.
-template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::keep_seen(const Lines& lines) {
+int Packet::keep_seen(const Lines& lines) {
     int met = 0;
     #pragma omp simd reduction(+ : met)
     for (int l = 0; l < N; l++) {
@@ -170,7 +168,7 @@ template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::keep_seen(const Lines& line
 }
 
 // The places of the samples 0, and the way from a sample to the next.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::place(const Lines& lines) {
+FHASH_INLINE void Packet::place(const Lines& lines) {
     float *const at[3] = {ox, oy, oz}, *const pace[3] = {dx, dy, dz};
     float *const inverse[3] = {ix, iy, iz}, *const far[3] = {farx, fary, farz};
     int* const rising[3] = {upx, upy, upz};
@@ -198,7 +196,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::place(const Lines& lines) 
 }
 
 // Nothing is seen yet.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::reset() {
+FHASH_INLINE void Packet::reset() {
     #pragma omp simd
     for (int l = 0; l < N; l++) {
         clear[l] = 1;
@@ -206,7 +204,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::reset() {
         r[l] = g[l] = b[l] = a[l] = 0;
         left[l] = 1;
         depth[l] = FAR;
-        best[l] = FLAGS & ATTENUATED ? 0.f : -FAR;
+        best[l] = flags & ATTENUATED ? 0.f : -FAR;
         where[l] = quitting[l] = 0;
         previous[l] = NONE;
     }
@@ -214,7 +212,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::reset() {
 }
 
 // The directions towards the light, and halfway between the light and the eye.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::aim_light(const Lines& lines) {
+void Packet::aim_light(const Lines& lines) {
     alignas(64) double half[3][N], size[N];
     const bool at_eye = m.lamp[0] == 0 && m.lamp[1] == 0 && m.lamp[2] == 0;
     float* const towards[3][2] = {{tox, hx}, {toy, hy}, {toz, hz}};

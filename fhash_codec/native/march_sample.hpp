@@ -1,4 +1,4 @@
-// Samples of the rays of a packet in plain loops.
+// Samples of the rays of a packet, in plain loops unless there is AVX-512.
 #pragma once
 
 #include "march_packet.hpp"
@@ -8,7 +8,11 @@ namespace {
 
 // Take the values of a pass, their entries in the table and opacities, and the gradients if they
 // are shaded by.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::sample(Counters& counted, Seen& seen) {
+template <Taken KIND> void Packet::sample(Counters& counted, Seen& seen) {
+#if defined(FHASH_WIDE)
+    sample_wide<KIND>(*this, counted, seen);
+#else
+    const float sign = flags & MINIMUM ? -1.f : 1.f;
     const float* const v = m.values;
     const float* const table = m.table;
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
@@ -38,8 +42,8 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::sample(Counters& counted, 
         const float here = s0 + fz * (s1 - s0);
         const int known = here == here;
         value[l] = here;
-        if (FLAGS & MAXIMUM) {
-            const float ranked = FLAGS & MINIMUM ? -here : here;
+        if (KIND == LARGEST) {
+            const float ranked = sign * here;
             const int better = on[l] & (ranked > best[l]);
             best[l] = better ? ranked : best[l];
             where[l] = better ? k[l] : where[l];
@@ -54,7 +58,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::sample(Counters& counted, 
             alpha[l] = taken;
             some |= taken > 0;
         }
-        if (FLAGS & SHADED) {
+        if (KIND == GRADIENTS) {
             const float e0 = d0 + fy * (d1 - d0), e1 = d2 + fy * (d3 - d2);
             const float ex = (e0 + fz * (e1 - e0)) * wx;
             const float ey = ((p1 - p0) + fz * ((p3 - p2) - (p1 - p0))) * wy;
@@ -73,10 +77,11 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::sample(Counters& counted, 
     seen.any = some;
     seen.ending = end;
     seen.lost = none;
+#endif
 }
 
 // The opacity of last steps, which are as long as the rest of the path.
-template <int FLAGS> void Packet<FLAGS>::shorten() {
+void Packet::shorten() {
     for (int l = 0; l < N; l++) {
         if (!on[l] || k[l] != last[l] || !(alpha[l] > 0)) continue;
         const int t = (int)at[l];
@@ -88,7 +93,7 @@ template <int FLAGS> void Packet<FLAGS>::shorten() {
 }
 
 // The opacity and the colours of one ray at its entry of the table.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::look_up(int l) {
+FHASH_INLINE void Packet::look_up(int l) {
     const int t = (int)at[l];
     const float* const entry = m.table + 4 * t;
     const float share = at[l] - t;
@@ -99,7 +104,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::look_up(int l) {
 }
 
 // Look again at samples without a value: on faces of cells a vertex without one may have no weight.
-template <int FLAGS> void Packet<FLAGS>::mend() {
+void Packet::mend() {
     for (int l = 0; l < N; l++) {
         if (!on[l] || value[l] == value[l]) continue;
         const FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
@@ -122,45 +127,42 @@ FHASH_INLINE float value_at(const FhashMarch& m, const float* values, float x, f
 }
 
 // Replace the gradients by central differences of values, as fhash_central does.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::slopes(const float* values) {
+void Packet::slopes(const float* values) {
     if (m.network && values == m.values) return central_slopes_of_network();
     int lost = 0;
-#if defined(FHASH_AVX512)
-    if constexpr (FLAGS & WIDE) {
-        lost = slopes_wide(*this, values);
-    } else
-#endif
-    {
-        const float mx = (float)(m.shape[2] - 1), my = (float)(m.shape[1] - 1);
-        const float mz = (float)(m.shape[0] - 1);
-        const float wx = 0.5f * (float)m.gradient[0], wy = 0.5f * (float)m.gradient[1];
-        const float wz = 0.5f * (float)m.gradient[2];
-        #pragma omp simd reduction(| : lost)
-        for (int l = 0; l < N; l++) {
-            const float x = px[l], y = py[l], z = pz[l];
-            const float east = value_at(m, values, min(x + 1, mx), y, z);
-            const float ex = (east - value_at(m, values, max(x - 1, 0.f), y, z)) * wx;
-            const float north = value_at(m, values, x, min(y + 1, my), z);
-            const float ey = (north - value_at(m, values, x, max(y - 1, 0.f), z)) * wy;
-            const float above = value_at(m, values, x, y, min(z + 1, mz));
-            const float ez = (above - value_at(m, values, x, y, max(z - 1, 0.f))) * wz;
-            gx[l] = ex == ex ? ex : gx[l];
-            gy[l] = ey == ey ? ey : gy[l];
-            gz[l] = ez == ez ? ez : gz[l];
-            lost |= (alpha[l] > 0) & !((ex == ex) & (ey == ey) & (ez == ez));
-        }
+#if defined(FHASH_WIDE)
+    lost = slopes_wide(*this, values);
+#else
+    const float mx = (float)(m.shape[2] - 1), my = (float)(m.shape[1] - 1);
+    const float mz = (float)(m.shape[0] - 1);
+    const float wx = 0.5f * (float)m.gradient[0], wy = 0.5f * (float)m.gradient[1];
+    const float wz = 0.5f * (float)m.gradient[2];
+    #pragma omp simd reduction(| : lost)
+    for (int l = 0; l < N; l++) {
+        const float x = px[l], y = py[l], z = pz[l];
+        const float east = value_at(m, values, min(x + 1, mx), y, z);
+        const float ex = (east - value_at(m, values, max(x - 1, 0.f), y, z)) * wx;
+        const float north = value_at(m, values, x, min(y + 1, my), z);
+        const float ey = (north - value_at(m, values, x, max(y - 1, 0.f), z)) * wy;
+        const float above = value_at(m, values, x, y, min(z + 1, mz));
+        const float ez = (above - value_at(m, values, x, y, max(z - 1, 0.f))) * wz;
+        gx[l] = ex == ex ? ex : gx[l];
+        gy[l] = ey == ey ? ey : gy[l];
+        gz[l] = ez == ez ? ez : gz[l];
+        lost |= (alpha[l] > 0) & !((ex == ex) & (ey == ey) & (ez == ez));
     }
+#endif
     if (lost) mend_slopes(values);
 }
 
 // Look again at the central differences of a pass, as `mend` does.
-template <int FLAGS> void Packet<FLAGS>::mend_slopes(const float* values) {
+void Packet::mend_slopes(const float* values) {
     for (int l = 0; l < N; l++)
         if (alpha[l] > 0) mend_slope(l, values);
 }
 
 // The same for one ray.
-template <int FLAGS> void Packet<FLAGS>::mend_slope(int l, const float* values) {
+void Packet::mend_slope(int l, const float* values) {
     FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
     fhash_central(m, values, px[l], py[l], pz[l], here);
     gx[l] = known_or_zero(here.gx * m.gradient[0]);

@@ -8,14 +8,9 @@ namespace {
 
 // Move rays on over what is invisible, and let those take part in the pass that have a sample to
 // take. Returns 1 if there is one, plus 2 if any ray is not at its end.
-template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::skip(Counters& counted) {
-    const bool by_cells = m.cells && !(FLAGS & MAXIMUM);
-#if defined(FHASH_AVX512)
-    if constexpr (FLAGS & WIDE)
-        return by_cells ? leap_wide<FLAGS, true>(*this, counted)
-                        : leap_wide<FLAGS, false>(*this, counted);
-#endif
-    return by_cells ? leap<true>(counted) : leap<false>(counted);
+FHASH_INLINE int Packet::skip(Counters& counted) {
+    if (flags & MAXIMUM) return leap<BY_LARGEST>(counted);
+    return m.cells ? leap<BY_CELLS>(counted) : leap<BY_BRICKS>(counted);
 }
 
 // The cell of a ray's next sample, the cell's brick, and the number of that brick.
@@ -23,8 +18,7 @@ struct Spot {
     int i, j, h, jx, jy, jz, brick;
 };
 
-template <int FLAGS>
-FHASH_INLINE Spot spot_of(const Packet<FLAGS>& p, int l, int lx, int ly, int lz, int bx, int by) {
+FHASH_INLINE Spot spot_of(const Packet& p, int l, int lx, int ly, int lz, int bx, int by) {
     const float f = min((float)p.k[l], p.farthest[l]), bricks = 1.f / FHASH_BRICK;
     const int i = min((int)clamp(p.ox[l] + f * p.dx[l], p.low[0], p.high[0]), max(lx - 2, 0));
     const int j = min((int)clamp(p.oy[l] + f * p.dy[l], p.low[1], p.high[1]), max(ly - 2, 0));
@@ -42,8 +36,7 @@ FHASH_INLINE int empty(const uint32_t* cells, int i, int j, int h, int brick) {
 
 // The place, in samples, at which a ray leaves what it leaps over: one cell, if `cell` is 1, or the
 // bricks up to w around the one at its sample. Rather a sample short of the end than one beyond it.
-template <int FLAGS>
-FHASH_INLINE float reach(const Packet<FLAGS>& p, int l, const Spot& at, int w, int cell) {
+FHASH_INLINE float reach(const Packet& p, int l, const Spot& at, int w, int cell) {
     const float side = (float)FHASH_BRICK, near = (float)w * side, lone = (float)cell;
     const float across = side * (float)(1 + 2 * w) - lone * (side - 1);
     const float west = (float)at.jx * side, south = (float)at.jy * side;
@@ -57,10 +50,11 @@ FHASH_INLINE float reach(const Packet<FLAGS>& p, int l, const Spot& at, int w, i
     return min(min(min(tx, ty), tz), 1e9f) * (1 - 2e-6f);
 }
 
-// `skip` in plain loops. CELLS: cell by cell within the bricks that matter.
-template <int FLAGS>
-template <bool CELLS>
-FHASH_INLINE int Packet<FLAGS>::leap(Counters& counted) {
+// `skip` in plain loops, unless there is AVX-512.
+template <Leaps BY> int Packet::leap(Counters& counted) {
+#if defined(FHASH_WIDE)
+    return leap_wide<BY>(*this, counted);
+#else
     const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const int keeping = m.surfaces > 0;
@@ -75,8 +69,8 @@ FHASH_INLINE int Packet<FLAGS>::leap(Counters& counted) {
         const int going = k[l] < count[l];
         const Spot at = spot_of(*this, l, lx, ly, lz, bx, by);
         int away;
-        if (FLAGS & MAXIMUM) away = !(highest[at.brick] > best[l]);
-        else if (CELLS) away = empty(cells, at.i, at.j, at.h, at.brick);
+        if (BY == BY_LARGEST) away = !(highest[at.brick] > best[l]);
+        else if (BY == BY_CELLS) away = empty(cells, at.i, at.j, at.h, at.brick);
         else away = distance[at.brick] > 0;
         any |= going & away;
         on[l] = going;
@@ -91,9 +85,9 @@ FHASH_INLINE int Packet<FLAGS>::leap(Counters& counted) {
         const int going = k[l] < count[l];
         const Spot at = spot_of(*this, l, lx, ly, lz, bx, by);
         int away, w = 0, cell = 0;
-        if (FLAGS & MAXIMUM) away = highest[at.brick] > best[l] ? 0 : 1;
+        if (BY == BY_LARGEST) away = highest[at.brick] > best[l] ? 0 : 1;
         else away = distance[at.brick], w = away - 1;
-        if (CELLS) {  // a brick that matters: over one cell of it
+        if (BY == BY_CELLS) {  // a brick that matters: over one cell of it
             cell = away == 0;
             w += cell;
             away = empty(cells, at.i, at.j, at.h, at.brick);
@@ -119,10 +113,11 @@ FHASH_INLINE int Packet<FLAGS>::leap(Counters& counted) {
         for (int l = 0; l < N; l++) alive |= k[l] < count[l];
     }
     return (here ? 1 : 0) | (alive ? 2 : 0);
+#endif
 }
 
 // Whether the cell at a place of a ray is visible.
-template <int FLAGS> bool Packet<FLAGS>::visible(int l, double sample) const {
+bool Packet::visible(int l, double sample) const {
     int at[3];
     for (int c = 0; c < 3; c++) {
         const double most = (double)m.shape[2 - c] - 1;
@@ -137,7 +132,7 @@ template <int FLAGS> bool Packet<FLAGS>::visible(int l, double sample) const {
 
 // Look at where rays enter, if that is in a visible cell: a surface may lie before the first
 // sample.
-template <int FLAGS> void Packet<FLAGS>::meet(Counters& counted) {
+void Packet::meet(Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (k[l] >= count[l] || !visible(l, entered[l])) continue;
         previous[l] = (float)border(l, entered[l]).value;
@@ -147,7 +142,7 @@ template <int FLAGS> void Packet<FLAGS>::meet(Counters& counted) {
 
 // Let rays that leapt to their ends take their last sample, if they leave the box by a visible
 // cell: a surface may lie behind it. leapt: whether each ray leapt in this pass.
-template <int FLAGS> void Packet<FLAGS>::part_ways(const int* leapt, Counters& counted) {
+void Packet::part_ways(const int* leapt, Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (!leapt[l] || k[l] < count[l] || !visible(l, leaving[l])) continue;
         from[l] = max(count[l] - 2.0, entered[l]);

@@ -7,8 +7,7 @@ namespace {
 
 // Set depth and normal of a ray, where less than half of the light is left for the first time.
 // given: the cell there, or null.
-template <int FLAGS>
-void Packet<FLAGS>::see(int l, double sample, const FhashCell* given, Counters& counted) {
+void Packet::see(int l, double sample, const FhashCell* given, Counters& counted) {
     if (depth[l] < FAR) return;
     depth[l] = (float)(begin[l] + sample * m.step);
     if (!m.normal) return;
@@ -27,8 +26,7 @@ void Packet<FLAGS>::see(int l, double sample, const FhashCell* given, Counters& 
 
 // The place of a surface between `from` with the value `previous` and `to` with `now`: regula falsi
 // by Illinois, until the root is within 1e-7 of a step or the value as near as rounding allows.
-template <int FLAGS>
-FHASH_INLINE double Packet<FLAGS>::root(int l, double level, double to, double now,
+double Packet::root(int l, double level, double to, double now,
                                          Counters& counted) const {
     double low = from[l], high = to, f_low = previous[l] - level, f_high = now - level;
     double place = f_high == 0 ? high : low;
@@ -48,8 +46,7 @@ FHASH_INLINE double Packet<FLAGS>::root(int l, double level, double to, double n
 }
 
 // Add a surface at a place of a ray to the colours, lit. surface: value, red, green, blue, opacity.
-template <int FLAGS>
-FHASH_INLINE void Packet<FLAGS>::add_surface(int l, double sample, const double* surface,
+void Packet::add_surface(int l, double sample, const double* surface,
                                               Counters& counted) {
     const FhashCell here = cell(l, sample);
     const double at[3] = {o[0][l] + sample * d[0][l], o[1][l] + sample * d[1][l],
@@ -81,7 +78,7 @@ FHASH_INLINE void Packet<FLAGS>::add_surface(int l, double sample, const double*
 
 // Add the surfaces between `from` with the value `previous` and `to` with `now`, in the order in
 // which the ray meets them.
-template <int FLAGS> void Packet<FLAGS>::cross(int l, double to, double now, Counters& counted) {
+void Packet::cross(int l, double to, double now, Counters& counted) {
     const double before = previous[l];
     if (!(before == before) || !(now == now)) return;
     struct Root {
@@ -103,7 +100,7 @@ template <int FLAGS> void Packet<FLAGS>::cross(int l, double to, double now, Cou
 }
 
 // Add the surfaces before the samples of this pass, and behind the samples beyond the path.
-template <int FLAGS> void Packet<FLAGS>::surfaces(Counters& counted) {
+void Packet::surfaces(Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (!on[l]) continue;
         if (!(previous[l] == previous[l])) {
@@ -125,7 +122,7 @@ template <int FLAGS> void Packet<FLAGS>::surfaces(Counters& counted) {
 }
 
 // Add the surfaces between last samples and the ends of their paths.
-template <int FLAGS> void Packet<FLAGS>::finish(Counters& counted) {
+void Packet::finish(Counters& counted) {
     for (int l = 0; l < N; l++)
         if (on[l] && k[l] + 1 == count[l] && leaving[l] > k[l]) {
             counted.samples++;

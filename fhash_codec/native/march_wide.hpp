@@ -3,13 +3,8 @@
 
 #include "march_packet.hpp"
 
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
-#define FHASH_AVX512 \
-    __attribute__((target("arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512")))
-#pragma GCC diagnostic ignored "-Wuninitialized"  // by the header of GCC 12 itself
-#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
-#include <immintrin.h>
-#define FHASH_WIDE FHASH_AVX512 inline __attribute__((always_inline))
+#if FHASH_TARGET == 4
+#define FHASH_WIDE FHASH_INLINE
 
 namespace {
 
@@ -72,7 +67,7 @@ struct Spots {
     __m512i jx, jy, jz;  // bricks
     __m512i brick;       // numbers of the bricks
 };
-template <int FLAGS> FHASH_WIDE Spots spots_of(const Packet<FLAGS>& p, __m512i k) {
+FHASH_WIDE Spots spots_of(const Packet& p, __m512i k) {
     const FhashMarch& m = p.m;
     const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
@@ -96,15 +91,15 @@ template <int FLAGS> FHASH_WIDE Spots spots_of(const Packet<FLAGS>& p, __m512i k
 }
 
 // The rays whose sample lies in an invisible cell or brick.
-template <int FLAGS, bool CELLS>
-FHASH_WIDE __mmask16 invisible(const Packet<FLAGS>& p, const Spots& at) {
+template <Leaps BY>
+FHASH_WIDE __mmask16 invisible(const Packet& p, const Spots& at) {
     const FhashMarch& m = p.m;
     const __m512i one = _mm512_set1_epi32(1), three = _mm512_set1_epi32(3);
-    if (FLAGS & MAXIMUM) {
+    if (BY == BY_LARGEST) {
         const __m512 highest = _mm512_i32gather_ps(at.brick, m.highest, 4);
         return ~_mm512_cmp_ps_mask(highest, _mm512_load_ps(p.best), _CMP_GT_OQ);
     }
-    if (CELLS) {
+    if (BY == BY_CELLS) {
         const __m512i half = _mm512_and_si512(_mm512_srai_epi32(at.h, 1), one);
         const __m512i word = _mm512_add_epi32(_mm512_slli_epi32(at.brick, 1), half);
         const __m512i bits = _mm512_i32gather_epi32(word, m.cells, 4);
@@ -120,16 +115,16 @@ FHASH_WIDE __mmask16 invisible(const Packet<FLAGS>& p, const Spots& at) {
 
 // The first samples behind what is invisible around samples: the cell, or the bricks as far as none
 // matters. away: the rays that it is needed for.
-template <int FLAGS, bool CELLS>
-FHASH_WIDE __m512i behind_invisible(const Packet<FLAGS>& p, const Spots& at, __mmask16 away,
+template <Leaps BY>
+FHASH_WIDE __m512i behind_invisible(const Packet& p, const Spots& at, __mmask16 away,
                                     __m512i k) {
     const __m512i zero = _mm512_setzero_si512(), one = _mm512_set1_epi32(1);
     __m512i w = zero, side = _mm512_set1_epi32(FHASH_BRICK), x = _mm512_slli_epi32(at.jx, 2);
     __m512i y = _mm512_slli_epi32(at.jy, 2), z = _mm512_slli_epi32(at.jz, 2);
-    if (!(FLAGS & MAXIMUM)) {
+    if (BY != BY_LARGEST) {
         const __m512i far = _mm512_mask_i32gather_epi32(one, away, at.brick, p.m.distance, 4);
         w = _mm512_slli_epi32(_mm512_sub_epi32(far, one), 2);
-        if (CELLS) {
+        if (BY == BY_CELLS) {
             // A brick that matters: over one cell of it.
             const __mmask16 cell = _mm512_testn_epi32_mask(far, far);
             w = _mm512_mask_mov_epi32(w, cell, zero);
@@ -153,8 +148,8 @@ FHASH_WIDE __m512i behind_invisible(const Packet<FLAGS>& p, const Spots& at, __m
 
 // `skip` by AVX-512. Rays with a sample to take wait a turn for those that leap over something, so
 // that more rays are in a pass.
-template <int FLAGS, bool CELLS>
-FHASH_AVX512 __attribute__((noinline)) int leap_wide(Packet<FLAGS>& p, Counters& counted) {
+template <Leaps BY>
+FHASH_WIDE int leap_wide(Packet& p, Counters& counted) {
     const FhashMarch& m = p.m;
     const __m512i one = _mm512_set1_epi32(1), count = _mm512_load_si512(p.count);
     const __m512 previous = _mm512_load_ps(p.previous);
@@ -169,12 +164,12 @@ FHASH_AVX512 __attribute__((noinline)) int leap_wide(Packet<FLAGS>& p, Counters&
             break;
         }
         const Spots at = spots_of(p, k);
-        __mmask16 away = invisible<FLAGS, CELLS>(p, at) & going;
+        __mmask16 away = invisible<BY>(p, at) & going;
         quitting = away & kept;
         away &= ~kept;
         on = going & ~away;
         if (!away || (on && turn > 0)) break;
-        k = _mm512_mask_min_epi32(k, away, behind_invisible<FLAGS, CELLS>(p, at, away, k), count);
+        k = _mm512_mask_min_epi32(k, away, behind_invisible<BY>(p, at, away, k), count);
         leapt |= away;
         counted.skips += __builtin_popcount(away);
     }
@@ -217,9 +212,7 @@ FHASH_WIDE Corners corners_at(const FhashMarch& m, const float* values, __m512 x
 }
 
 // `sample` by AVX-512, and the colours.
-template <int FLAGS>
-FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counters& counted,
-                                                        Seen& seen) {
+template <Taken KIND> FHASH_WIDE void sample_wide(Packet& p, Counters& counted, Seen& seen) {
     const FhashMarch& m = p.m;
     const __m512 zero = _mm512_setzero_ps();
     const __m512i k = _mm512_load_si512(p.k);
@@ -237,8 +230,8 @@ FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counte
     const __m512 s0 = between(p0, p1, fy), s1 = between(p2, p3, fy), here = between(s0, s1, fz);
     const __mmask16 known = _mm512_cmp_ps_mask(here, here, _CMP_ORD_Q);
     _mm512_store_ps(p.value, here);
-    if (FLAGS & MAXIMUM) {
-        const __m512 ranked = FLAGS & MINIMUM ? _mm512_sub_ps(zero, here) : here;
+    if (KIND == LARGEST) {
+        const __m512 ranked = p.flags & MINIMUM ? _mm512_sub_ps(zero, here) : here;
         const __m512 best = _mm512_load_ps(p.best);
         const __mmask16 better = on & _mm512_cmp_ps_mask(ranked, best, _CMP_GT_OQ);
         _mm512_mask_store_ps(p.best, better, ranked);
@@ -262,7 +255,7 @@ FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counte
         _mm512_store_ps(p.cb, between(one[2], other[2], share));
         seen.any = _mm512_cmp_ps_mask(alpha, zero, _CMP_GT_OQ) != 0;
     }
-    if (FLAGS & SHADED) {
+    if (KIND == GRADIENTS) {
         const __m512 e0 = between(d0, d1, fy), e1 = between(d2, d3, fy);
         const __m512 ex = between(e0, e1, fz), ez = _mm512_sub_ps(s1, s0);
         const __m512 ey = between(_mm512_sub_ps(p1, p0), _mm512_sub_ps(p3, p2), fz);
@@ -299,9 +292,7 @@ FHASH_WIDE __mmask16 slope(__m512 behind, __m512 before, double factor, float* t
 }
 
 // `slopes` by AVX-512. Returns whether a difference that is needed is missing.
-template <int FLAGS>
-FHASH_AVX512 __attribute__((noinline)) int slopes_wide(Packet<FLAGS>& p,
-                                                        const float* values) {
+FHASH_WIDE int slopes_wide(Packet& p, const float* values) {
     const FhashMarch& m = p.m;
     const __m512 zero = _mm512_setzero_ps(), one = _mm512_set1_ps(1.f);
     const __m512 mx = _mm512_set1_ps((float)(m.shape[2] - 1));

@@ -119,7 +119,7 @@ FHASH_INLINE void products_of(const double* FHASH_RESTRICT inputs, int64_t n,
     }
 }
 
-FHASH_CLONES EXACT_SUMS void products(const double* inputs, int64_t n, const double* weights,
+FHASH_CLONES_512 EXACT_SUMS void products(const double* inputs, int64_t n, const double* weights,
                                       int64_t outputs, double* sums, int64_t stride) {
     int64_t o = 0;
     for (; o + 4 <= outputs; o += 4)
@@ -159,7 +159,7 @@ FHASH_INLINE void gather_rows(const double* slopes, int64_t stride, const double
         gather_of<OUTPUTS, 1>(slopes, stride, inputs + k * BLOCK, n, sums + k * LANES);
 }
 
-FHASH_CLONES EXACT_SUMS void gather(const double* slopes, int64_t stride, int64_t outputs,
+FHASH_CLONES_512 EXACT_SUMS void gather(const double* slopes, int64_t stride, int64_t outputs,
                                     const double* inputs, int64_t n, double* sums) {
     int64_t o = 0;
     for (; o + 2 <= outputs; o += 2)
@@ -170,7 +170,7 @@ FHASH_CLONES EXACT_SUMS void gather(const double* slopes, int64_t stride, int64_
 
 // sums[o] += sum over the voxels of a block of slopes[o], each in eight lanes; `each` blocks follow
 // one another for each o.
-FHASH_CLONES void gather_biases(const double* FHASH_RESTRICT slopes, int64_t each, int64_t outputs,
+FHASH_CLONES_512 void gather_biases(const double* FHASH_RESTRICT slopes, int64_t each, int64_t outputs,
                                 double* FHASH_RESTRICT sums) {
     for (int64_t o = 0; o < outputs; ++o)
         for (int64_t v = 0; v < each * BLOCK; v += LANES)
@@ -178,12 +178,12 @@ FHASH_CLONES void gather_biases(const double* FHASH_RESTRICT slopes, int64_t eac
                 sums[o * LANES + i] += slopes[o * each * BLOCK + v + i];
 }
 
-FHASH_CLONES void widened(const int16_t* FHASH_RESTRICT in, double* FHASH_RESTRICT out) {
+FHASH_CLONES_512 void widened(const int16_t* FHASH_RESTRICT in, double* FHASH_RESTRICT out) {
     for (int64_t i = 0; i < BLOCK; ++i) out[i] = in[i];
 }
 
 // Sums to activations: leaky, clipped, rounded half to even.
-FHASH_CLONES void activate(double* FHASH_RESTRICT values, int64_t outputs, double scale,
+FHASH_CLONES_512 void activate(double* FHASH_RESTRICT values, int64_t outputs, double scale,
                            const double* FHASH_RESTRICT biases, int64_t each) {
     for (int64_t o = 0; o < outputs; ++o) {
         const double bias = biases[o / each] * ACTIVATION_UNIT;
@@ -197,7 +197,7 @@ FHASH_CLONES void activate(double* FHASH_RESTRICT values, int64_t outputs, doubl
 
 // Outputs of the last layer, in place, to errors. An output beyond the clip range is clipped, and
 // its slope is 0.
-FHASH_CLONES void errors_of(double* FHASH_RESTRICT values, double scale, double bias,
+FHASH_CLONES_512 void errors_of(double* FHASH_RESTRICT values, double scale, double bias,
                             const int32_t* FHASH_RESTRICT targets,
                             const int32_t* FHASH_RESTRICT lowest,
                             const int32_t* FHASH_RESTRICT highest, double* FHASH_RESTRICT slopes) {
@@ -214,7 +214,7 @@ FHASH_CLONES void errors_of(double* FHASH_RESTRICT values, double scale, double 
 }
 
 // Slopes of sums from those of activations: times the slope of the leaky unit; limited, rounded.
-FHASH_CLONES void descend(double* FHASH_RESTRICT slopes, int64_t outputs, double scale,
+FHASH_CLONES_512 void descend(double* FHASH_RESTRICT slopes, int64_t outputs, double scale,
                           const double* FHASH_RESTRICT activations) {
     for (int64_t i = 0; i < outputs * BLOCK; ++i) {
         const double leaky = activations[i] > 0 ? 1.0 : 0.125;

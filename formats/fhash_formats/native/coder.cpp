@@ -86,7 +86,7 @@ template <Mode MODE, bool TRELLIS> struct Coder {
     }
 
     // A magnitude from UNARY on, as an Exp-Golomb number; -1 for one that no encoder writes.
-    FHASH_INLINE int code_escape(int magnitude, int level) {
+    int code_escape(int magnitude, int level) {
         const int64_t escape = level * 64;
         const uint32_t rest = MODE == DECODE ? 0 : (uint32_t)magnitude - UNARY + 1;
         int bits = 0;
@@ -101,12 +101,12 @@ template <Mode MODE, bool TRELLIS> struct Coder {
         return (int)min<uint32_t>(v + (UNARY - 1), 0x7fffffff);
     }
 
-    FHASH_INLINE int64_t run();
+    int64_t run();
 };
 
 // Code all bands. 0, or -1 for bytes that no encoder writes and for a band beyond the shape, or
 // NO_TRELLIS.
-template <Mode MODE, bool TRELLIS> FHASH_INLINE int64_t Coder<MODE, TRELLIS>::run() {
+template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
     int32_t* const q = task.q;
     const float* const scaled = task.scaled;
     const int64_t* const shape = task.shape;
@@ -301,20 +301,12 @@ template <Mode MODE, bool TRELLIS> FHASH_INLINE int64_t Coder<MODE, TRELLIS>::ru
 }
 
 // One run. It works on a coder of its own, whose range can then stay in registers.
-template <Mode MODE, bool TRELLIS> FHASH_INLINE int64_t run(const Task& task) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        Coder<MODE, TRELLIS> coder = {range_of<MODE>(task), task};
-        const int64_t code = coder.run();
-        finish(coder.range);
-        return code;
-    });
+template <Mode MODE, bool TRELLIS> int64_t run(const Task& task) {
+    Coder<MODE, TRELLIS> coder = {range_of<MODE>(task), task};
+    const int64_t code = coder.run();
+    finish(coder.range);
+    return code;
 }
-
-FHASH_TWO_CLONES int64_t encode(const Task& task) { return run<ENCODE, false>(task); }
-FHASH_TWO_CLONES int64_t encode_two(const Task& task) { return run<ENCODE, true>(task); }
-FHASH_TWO_CLONES int64_t choose(const Task& task) { return run<CHOOSE, false>(task); }
-FHASH_TWO_CLONES int64_t decode(const Task& task) { return run<DECODE, false>(task); }
-FHASH_TWO_CLONES int64_t decode_two(const Task& task) { return run<DECODE, true>(task); }
 
 }  // namespace
 
@@ -331,11 +323,13 @@ FHASH_TWO_CLONES int64_t decode_two(const Task& task) { return run<DECODE, true>
 // more room.
 //
 // Returns the number of bytes, NO_MEMORY, or NO_TRELLIS for an integer that its quantiser lacks.
-FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda, int64_t trellis,
-                                  const int64_t* shape, const int32_t* table, int64_t count,
-                                  uint16_t* slots, int64_t slot_count, int32_t* weights,
-                                  int64_t weight_count, uint16_t* simples, int64_t simple_count,
-                                  int64_t keep, uint8_t* data, int64_t capacity) {
+FHASH_FOR_TARGETS(fhash_encode,
+                  (int32_t* q, const float* scaled, double lambda, int64_t trellis,
+                   const int64_t* shape, const int32_t* table, int64_t count, uint16_t* slots,
+                   int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples,
+                   int64_t simple_count, int64_t keep, uint8_t* data, int64_t capacity),
+                  (q, scaled, lambda, trellis, shape, table, count, slots, slot_count, weights,
+                   weight_count, simples, simple_count, keep, data, capacity)) {
     return guarded([&]() -> int64_t {
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
@@ -344,7 +338,9 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
         std::vector<uint8_t> out;
         const Task task = {&state, &flags, &signs, q,    scaled,  lambda / 2048,
                            shape,  table,  count,  &out, nullptr, 0};
-        const int64_t code = scaled ? choose(task) : trellis ? encode_two(task) : encode(task);
+        const int64_t code = scaled    ? run<CHOOSE, false>(task)
+                             : trellis ? run<ENCODE, true>(task)
+                                       : run<ENCODE, false>(task);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) {
@@ -359,11 +355,13 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
 // Decode integers into q, which must be zeros; the other arguments are those of fhash_encode.
 //
 // Returns 0, or -1 for bytes that no encoder writes and for a band beyond q, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode(int32_t* q, int64_t trellis, const int64_t* shape,
-                                  const int32_t* table, int64_t count, const uint16_t* slots,
-                                  int64_t slot_count, const int32_t* weights, int64_t weight_count,
-                                  const uint16_t* simples, int64_t simple_count,
-                                  const uint8_t* data, int64_t size) {
+FHASH_FOR_TARGETS(fhash_decode,
+                  (int32_t* q, int64_t trellis, const int64_t* shape, const int32_t* table,
+                   int64_t count, const uint16_t* slots, int64_t slot_count,
+                   const int32_t* weights, int64_t weight_count, const uint16_t* simples,
+                   int64_t simple_count, const uint8_t* data, int64_t size),
+                  (q, trellis, shape, table, count, slots, slot_count, weights, weight_count,
+                   simples, simple_count, data, size)) {
     return guarded([&] {
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
@@ -371,6 +369,6 @@ FHASH_EXPORT int64_t fhash_decode(int32_t* q, int64_t trellis, const int64_t* sh
         Flags flags(state);
         const Task task = {&state, &flags, &signs, q,       nullptr, 0,
                            shape,  table,  count,  nullptr, data,    size};
-        return trellis ? decode_two(task) : decode(task);
+        return trellis ? run<DECODE, true>(task) : run<DECODE, false>(task);
     });
 }

@@ -14,6 +14,47 @@
 
 namespace {
 
+const int MAX_MAGNITUDE = 4095; // as contexts see it, so that sums stay in 32 bits
+const int RATE_CLASSES = 16 * 15 + 1;  // of the rates of sign predictors (coder_signs.hpp)
+
+// Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
+FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }
+
+// The same in classes 0 to 11.
+FHASH_INLINE int twelve(int v) {
+    return seven(v) + (v > 14) + (v > 22) + (v > 36) + (v > 64) + (v > 140);
+}
+
+// `twelve` as a table, for one number at a time.
+struct Classes {
+    uint8_t of[142];
+    Classes() {
+        for (int v = 0; v < 142; v++) of[v] = (uint8_t)twelve(v);
+    }
+};
+const Classes classes;
+
+// Tables of the predictors. No value lies near a rounding boundary (a test checks that).
+struct LinearTables {
+    int16_t log[MAX_MAGNITUDE + 1];  // 256 log2(1 + magnitude)
+    int16_t rate[RATE_CLASSES];      // rate of a weight by 16 log2 of the mean square
+    LinearTables() {
+        for (int i = 0; i <= MAX_MAGNITUDE; i++)
+            log[i] = (int16_t)std::floor(256 * std::log2(1. + i) + .5);
+        for (int i = 0; i < RATE_CLASSES; i++) {
+            const double scale = 8388608 * std::exp(-i / 32. * 0.69314718055994531);
+            rate[i] = (int16_t)min(std::floor(.006 * scale + .5), 32767.);
+        }
+    }
+};
+const LinearTables linear_tables;
+
+}  // namespace
+
+#include "target.hpp"
+
+namespace {
+
 const int CONTEXTS = 4, SIGN_CONTEXTS = 4;  // estimates of a magnitude, and of a sign
 const int LANES = 2 * CONTEXTS, SET = padded(LANES);  // weights of a set, and with its zeros
 const int DECISIONS = 16;                   // slots of a context
@@ -22,7 +63,6 @@ const int SHARED = 2;  // decisions from this one on are one for both quantisers
                        // before it have the slots and weights from UNARY on
 const int LEVELS = 128;                     // quarter octaves of the expected magnitude
 const int SIGN_LIMIT = 255;                 // as SLOW_LIMIT, for signs
-const int MAX_MAGNITUDE = 4095;             // as contexts see it, so that sums stay in 32 bits
 const int PADDING = 2;                      // zeros beside a row of magnitudes
 const int LOG_PADDING = 4;                  // zeros beside a row of logarithms
 const int VECTOR = 16;  // sums over a row are made for a multiple of it; those beyond are not used
@@ -66,22 +106,6 @@ struct Flags {
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
 
-// Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
-FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }
-
-// The same in classes 0 to 11.
-FHASH_INLINE int twelve(int v) {
-    return seven(v) + (v > 14) + (v > 22) + (v > 36) + (v > 64) + (v > 140);
-}
-
-// `twelve` as a table, for one number at a time.
-struct Classes {
-    uint8_t of[142];
-    Classes() {
-        for (int v = 0; v < 142; v++) of[v] = (uint8_t)twelve(v);
-    }
-};
-const Classes classes;
 FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
 
 const int NO_TRELLIS = -3;  // an integer that the quantiser of its state does not have
@@ -139,7 +163,7 @@ struct Row {
 
 // Find the row of each reference that stands for this row; none where it and the rows above and
 // below it are zeros, which add nothing. Whether the row of the parent is filled.
-FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& band, Row& row) {
+int find_references(const std::vector<Band>& bands, const Band& band, Row& row) {
     int parent_filled = 0;
     for (int k = 0; k < REFERENCE_COUNT; k++) {
         const Reference& to = band.references[k];
@@ -169,7 +193,7 @@ struct Around {
     int weight;  // sum of the weights of the neighbours that exist, those to the left included
 };
 
-FHASH_INLINE Around rows_around(const Band& band, const Row& row, const uint16_t* nothing) {
+Around rows_around(const Band& band, const Row& row, const uint16_t* nothing) {
     const int t = row.t, z = row.z, y = row.y, n1 = band.size[1], n2 = band.size[2];
     const uint16_t* const M = row.magnitudes;
     const int64_t M0 = band.stride[0], M1 = band.stride[1], M2 = band.stride[2];
@@ -199,7 +223,7 @@ FHASH_INLINE Around rows_around(const Band& band, const Row& row, const uint16_t
 // Add the neighbours within the band, but those to the left, for `lanes` vertices: to the expected
 // magnitude, and with SHARES as shares in the contexts.
 template <bool SHARES>
-FHASH_INLINE void sum_neighbours(const Around& rows, int lanes, Sums& sums) {
+void sum_neighbours(const Around& rows, int lanes, Sums& sums) {
     const uint16_t *const a = rows.above, *const a2 = rows.above2;
     const uint16_t *const b = rows.before, *const b2 = rows.before2;
     const uint16_t *const bp = rows.before_near[0], *const bf = rows.before_near[1];
@@ -237,7 +261,7 @@ FHASH_INLINE void sum_neighbours(const Around& rows, int lanes, Sums& sums) {
 
 // Begin the sums of a row with those over its references. Sum of the weights of the references that
 // exist.
-FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band, const Row& row,
+int sum_references(const std::vector<Band>& bands, const Band& band, const Row& row,
                                 int lanes, const uint16_t* nothing, Sums& sums) {
     const int n3 = band.size[3];
     int32_t* FHASH_RESTRICT const expected = sums.expected;

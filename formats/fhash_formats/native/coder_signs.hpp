@@ -22,7 +22,6 @@ const int BEYOND = 32;        // numbers behind weights and inputs that vectors 
 const int LINEAR_MAX = 2047;  // largest logit, in 1/256
 const int GRADIENT_MAX = 181;  // largest gradient, in 1/128: the sums below stay in 16 bits
 const int PERIOD = 32;         // uses after which mean squares and rates are made anew
-const int RATE_CLASSES = 16 * 15 + 1;
 const int LOGIT_BIN = 85;      // a third, in 1/256: width of the classes of the logit
 const int SIGN_SET = 16;       // mixing weights of a sign: of SIGN_CONTEXTS estimates, of the logit
 
@@ -30,21 +29,6 @@ const int SIGN_SET = 16;       // mixing weights of a sign: of SIGN_CONTEXTS est
 // weights each, those of signs have no gaps.
 const int64_t BASE_WEIGHTS = int64_t(KINDS + 64) * DECISIONS * LANES;
 const int64_t SIGN_LINEAR = BASE_WEIGHTS + KINDS * SIGN_SET;
-
-// Tables of the predictors. No value lies near a rounding boundary (a test checks that).
-struct LinearTables {
-    int16_t log[MAX_MAGNITUDE + 1];  // 256 log2(1 + magnitude)
-    int16_t rate[RATE_CLASSES];      // rate of a weight by 16 log2 of the mean square
-    LinearTables() {
-        for (int i = 0; i <= MAX_MAGNITUDE; i++)
-            log[i] = (int16_t)std::floor(256 * std::log2(1. + i) + .5);
-        for (int i = 0; i < RATE_CLASSES; i++) {
-            const double scale = 8388608 * std::exp(-i / 32. * 0.69314718055994531);
-            rate[i] = (int16_t)min(std::floor(.006 * scale + .5), 32767.);
-        }
-    }
-};
-const LinearTables linear_tables;
 
 // The logarithm of a magnitude, with the sign of the value.
 FHASH_INLINE int16_t signed_log(int magnitude, bool negative) {

@@ -1,24 +1,6 @@
-// The fast coder (fast.hpp) for the baseline, and the choice between that and AVX2.
+// The fast coder (fast.hpp).
 #include "fast_decode.hpp"
 #include "fast_encode.hpp"
-
-using Encode = decltype(fhash_fast_encode_baseline);
-using Decode = decltype(fhash_fast_decode_baseline);
-Encode fhash_fast_encode_v3;  // fast_v3.cpp
-Decode fhash_fast_decode_v3;
-
-namespace {
-
-#if defined(__x86_64__)
-bool has_v3() { return (fhash_instructions() & FHASH_HAS_V3) != 0; }
-Encode* encoder() { return has_v3() ? fhash_fast_encode_v3 : fhash_fast_encode_baseline; }
-Decode* decoder() { return has_v3() ? fhash_fast_decode_v3 : fhash_fast_decode_baseline; }
-#else
-Encode* encoder() { return fhash_fast_encode_baseline; }
-Decode* decoder() { return fhash_fast_decode_baseline; }
-#endif
-
-}  // namespace
 
 // Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (plan.cpp), or
 // foretell what that takes. Integers outside the bands count as 0.
@@ -33,21 +15,41 @@ Decode* decoder() { return fhash_fast_decode_baseline; }
 // squared errors, in squared steps.
 //
 // Returns the number of bytes (0 for a price), -1 for a band beyond the shape, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_fast_encode(int32_t* q, const float* values, int64_t trellis,
-                                       double scale, double weight, const int64_t* shape,
-                                       const int32_t* table, int64_t count, const uint16_t* slots,
-                                       const uint8_t* defaults, uint8_t* data, int64_t capacity,
-                                       double* results) {
-    return encoder()(q, values, trellis, scale, weight, shape, table, count, slots, defaults, data,
-                     capacity, results);
+FHASH_FOR_TARGETS(fhash_fast_encode,
+                  (int32_t* q, const float* values, int64_t trellis, double scale, double weight,
+                   const int64_t* shape, const int32_t* table, int64_t count,
+                   const uint16_t* slots, const uint8_t* defaults, uint8_t* data,
+                   int64_t capacity, double* results),
+                  (q, values, trellis, scale, weight, shape, table, count, slots, defaults, data,
+                   capacity, results)) {
+    return guarded([&]() -> int64_t {
+        const Prior prior = {reinterpret_cast<const uint16_t(*)[TOKENS]>(slots), defaults, nullptr};
+        const SymbolBits bits(prior);
+        const Task task = {q,     values,        (float)scale, weight, shape,
+                           table, (size_t)count, prior,        bits,   trellis != 0};
+        std::vector<uint8_t> bytes;
+        const int64_t code = !q        ? write(PRICE, task, bytes, results)
+                             : !values ? write(ENCODE, task, bytes, results)
+                             : trellis ? write_paths(task, bytes, results)
+                                       : write(CHOOSE, task, bytes, results);
+        if (code < 0) return code;
+        if ((int64_t)bytes.size() <= capacity && !bytes.empty())
+            std::memcpy(data, bytes.data(), bytes.size());
+        return (int64_t)bytes.size();
+    });
 }
 
 // Decode integers into q, which must be zeros. trellis: whether they are those of one. lookup:
 // (CERTAIN + 1, SLOTS) of the prior.
 //
 // Returns 0, or -1 for bytes that no encoder writes and for a band beyond q, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_fast_decode(int32_t* q, int64_t trellis, const int64_t* shape,
-                                       const int32_t* table, int64_t count, const uint8_t* defaults,
-                                       const uint32_t* lookup, const uint8_t* data, int64_t size) {
-    return decoder()(q, trellis, shape, table, count, defaults, lookup, data, size);
+FHASH_FOR_TARGETS(fhash_fast_decode,
+                  (int32_t* q, int64_t trellis, const int64_t* shape, const int32_t* table,
+                   int64_t count, const uint8_t* defaults, const uint32_t* lookup,
+                   const uint8_t* data, int64_t size),
+                  (q, trellis, shape, table, count, defaults, lookup, data, size)) {
+    return guarded([&]() {
+        const Prior prior = {nullptr, defaults, lookup};
+        return read(q, trellis != 0, shape, table, count, prior, data, size);
+    });
 }

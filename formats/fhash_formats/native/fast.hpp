@@ -10,10 +10,7 @@
 // machine has the same levels. tests/reference/fast.py explains it.
 //
 // Here is what encoder and decoder share: the way through the bands, the flags, and what is known
-// around a row. It is compiled twice, for AVX2 (FHASH_FAST_V3, fast_v3.cpp) and for the baseline
-// (fast.cpp): GCC takes vectors apart before it inlines a function into one for another machine, so
-// that clones of one function would work place by place. What is included above stands before the
-// machine is chosen, as no function of a library may be compiled for AVX2 and linked into others.
+// around a row. It is compiled for the baseline (fast.cpp) and for AVX2 (fast_v3.cpp).
 #pragma once
 
 #include <cmath>
@@ -25,30 +22,10 @@
 
 #include "bands.hpp"
 #include "mixing.hpp"
-#if defined(FHASH_FAST_V3)
-#include <immintrin.h>
-#endif
+#include "target.hpp"
 
 #if !defined(__GNUC__)
 #error "GCC or Clang: the lanes are vectors by their extension of the language"
-#endif
-#if defined(FHASH_FAST_V3) && defined(__clang__)
-#pragma clang attribute push(__attribute__((target("avx2,bmi,bmi2,lzcnt"))), apply_to = function)
-#elif defined(FHASH_FAST_V3)
-#pragma GCC push_options
-#pragma GCC target("avx2,bmi,bmi2,lzcnt")
-#endif
-
-#if defined(FHASH_FAST_V3)
-#define FHASH_FAST(name) fhash_fast_##name##_v3
-#else
-#define FHASH_FAST(name) fhash_fast_##name##_baseline
-#endif
-// The end of what is compiled for a machine.
-#if defined(FHASH_FAST_V3) && defined(__clang__)
-#define FHASH_END_FAST _Pragma("clang attribute pop")
-#elif defined(FHASH_FAST_V3)
-#define FHASH_END_FAST _Pragma("GCC pop_options")
 #endif
 
 namespace {
@@ -169,7 +146,7 @@ FHASH_INLINE Ints next(Ints of) {
 }
 // The lanes of a mask, as bits.
 FHASH_INLINE int lanes_of(Ints mask) {
-#if defined(FHASH_FAST_V3)
+#if FHASH_TARGET == 3
     return _mm256_movemask_ps((__m256)mask);
 #else
     int lanes = 0;
@@ -226,12 +203,12 @@ struct Half {
 };
 
 // The way through the bands. Self codes: it has `look_at` a band before its flag, `some_in_row` and
-// `some_in_block` that say what flags are to be, `begin_block`, `code_half` and `end_block`. If it
-// GUESSES, it stays in the first state of a trellis.
+// `some_in_block` that say what flags are to be, `begin_block`, `code_half` and `end_block`.
 template <class Self, class Range> struct Lattice {
     const int64_t* shape;
     const Prior& prior;
     const bool trellis;
+    const bool steps_on;  // through the states of the trellis, or stays in the first one
     Ints states = {};  // of the trellis: each lane has its own
     std::vector<Band> bands;
     Range range;
@@ -264,8 +241,10 @@ template <class Self, class Range> struct Lattice {
     // Of signs of the row, by parity: how often one was that around it, and 2^16 for each other.
     Ints same[2][SIGNS];
 
-    Lattice(const int64_t* of, const Prior& with, bool on_trellis, size_t count, Range flag_coder)
-        : shape(of), prior(with), trellis(on_trellis), bands(count), range(flag_coder) {
+    Lattice(const int64_t* of, const Prior& with, bool on_trellis, bool on_states, size_t count,
+            Range flag_coder)
+        : shape(of), prior(with), trellis(on_trellis), steps_on(on_states), bands(count),
+          range(flag_coder) {
         for (Simple& flag : flags) flag = {32768, 0};
     }
 
@@ -292,11 +271,11 @@ template <class Self, class Range> struct Lattice {
                    shape[3] + band.low[3];
     }
 
-    FHASH_INLINE void run() {
+    void run() {
         for (Band& band : bands) code_band(band);
     }
 
-    FHASH_INLINE void code_band(Band& band) {
+    void code_band(Band& band) {
         const int64_t rows = (int64_t)band.size[0] * band.size[1] * band.size[2];
         const int length = band.size[3];
         if (!rows || !length) return;
@@ -327,7 +306,7 @@ template <class Self, class Range> struct Lattice {
     }
 
     // Find the rows around a row that a decoder knows, and which blocks lie near filled ones.
-    FHASH_INLINE void look_around(Band& band, int t, int z, int y) {
+    void look_around(Band& band, int t, int z, int y) {
         for (int k = 0; k < band.blocks; k += WORD) stored(near.data() + k, uint64_t{0});
         const int64_t layer = band.size[2], step = layer * band.size[1];
         const bool up = y > 0, down = y + 1 < band.size[2];
@@ -377,7 +356,7 @@ template <class Self, class Range> struct Lattice {
             }
     }
 
-    FHASH_INLINE void look_at_reference(Band& band, int k, int t, int z, int y) {
+    void look_at_reference(Band& band, int k, int t, int z, int y) {
         Band& other = bands[(size_t)band.references[k].band];
         std::memset(kin.data(), 0, kin.size());
         if (!other.any) return;
@@ -410,7 +389,7 @@ template <class Self, class Range> struct Lattice {
     }
 
     // Magnitudes of a row at the vertices of one of another length, after another shift.
-    FHASH_INLINE static void move_row(const uint8_t* from, int count, int along, int shift,
+    static void move_row(const uint8_t* from, int count, int along, int shift,
                                       uint8_t* to, int length) {
         if (along == 1) {
             const int pairs = min(length / 2, count);
@@ -446,7 +425,7 @@ template <class Self, class Range> struct Lattice {
         return sums;
     }
 
-    FHASH_INLINE void code_row(Band& band, int t, int z, int y) {
+    void code_row(Band& band, int t, int z, int y) {
         row.number = band.row(t, z, y);
         row.place = place_of(band, t, z, y);
         row.length = band.size[3];
@@ -553,7 +532,7 @@ template <class Self, class Range> struct Lattice {
 
     // Go on through the trellis, but for places beyond a row.
     FHASH_INLINE void step_on(const Half& half, int parity, int room) {
-        if (!trellis || Self::GUESSES) return;
+        if (!steps_on) return;
         const Ints after = states_after(states, half.magnitudes);
         states = PLACES + parity < room ? after : states;
     }
@@ -573,7 +552,7 @@ template <class Self, class Range> struct Lattice {
         same_or_not += ((products > 0) & 1) + ((products < 0) & OTHER);
     }
 
-    FHASH_INLINE void note_signs() {
+    void note_signs() {
         for (int parity = 0; parity < 2; parity++)
             for (int n = 0; n < (parity ? SIGNS : 3); n++) {
                 const Ints of = same[parity][n];

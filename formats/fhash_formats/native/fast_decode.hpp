@@ -28,7 +28,7 @@ struct BitsIn {
     }
 };
 
-#if defined(FHASH_FAST_V3)
+#if FHASH_TARGET == 3
 // By a mask of lanes: how many of them come before each.
 struct Order {
     uint8_t of[1 << LANES][LANES] = {};
@@ -43,7 +43,6 @@ constexpr Order order;  // nothing of this file may run when the library is load
 #endif
 
 struct Reader : Lattice<Reader, Decoder> {
-    static const bool GUESSES = false;
     int32_t* const q;
     BitsIn in;
     Ints state = {};
@@ -53,7 +52,7 @@ struct Reader : Lattice<Reader, Decoder> {
 
     Reader(int32_t* to, const int64_t* of, const Prior& with, bool on_trellis, size_t count,
            Decoder flag_coder, BitsIn bits)
-        : Lattice(of, with, on_trellis, count, flag_coder), q(to), in(bits) {}
+        : Lattice(of, with, on_trellis, on_trellis, count, flag_coder), q(to), in(bits) {}
 
     // What only an encoder knows.
     FHASH_INLINE void look_at(Band&) {}
@@ -117,7 +116,7 @@ struct Reader : Lattice<Reader, Decoder> {
     // Each lane that is low reads a word, in their order.
     FHASH_INLINE void read_words() {
         const Ints needs = (Words)state < LEAST_STATE;
-#if defined(FHASH_FAST_V3)
+#if FHASH_TARGET == 3
         const int mask = lanes_of(needs);
         const __m128i places_of = _mm_loadl_epi64((const __m128i*)order.of[mask]);
         const __m256i places = _mm256_cvtepu8_epi32(places_of);
@@ -172,7 +171,7 @@ bool take_section(const uint8_t*& data, int64_t& size, const uint8_t*& section, 
     return true;
 }
 
-FHASH_INLINE int64_t read(int32_t* q, bool trellis, const int64_t* shape, const int32_t* table,
+int64_t read(int32_t* q, bool trellis, const int64_t* shape, const int32_t* table,
                           int64_t count, const Prior& prior, const uint8_t* data, int64_t size) {
     const uint8_t *flags, *raw;
     int64_t flag_count, raw_count;
@@ -188,13 +187,3 @@ FHASH_INLINE int64_t read(int32_t* q, bool trellis, const int64_t* shape, const 
 }
 
 }  // namespace
-
-// See fast.cpp.
-int64_t FHASH_FAST(decode)(int32_t* q, int64_t trellis, const int64_t* shape, const int32_t* table,
-                           int64_t count, const uint8_t* defaults, const uint32_t* lookup,
-                           const uint8_t* data, int64_t size) {
-    return guarded([&]() {
-        const Prior prior = {nullptr, defaults, lookup};
-        return read(q, trellis != 0, shape, table, count, prior, data, size);
-    });
-}

@@ -2,7 +2,8 @@
 //
 // With PRICE nothing is written: the bytes are those that it would take, and by these transforms
 // are compared. On a trellis of two quantisers, GUESS finds the path through it for each lane, by
-// the contexts that guessed integers have, and FOLLOW writes it.
+// the contexts that guessed integers have, and FOLLOW writes it. The mode is known at run time: a
+// block of 16 vertices is so much work that asking for it costs nothing.
 #pragma once
 
 #include "fast.hpp"
@@ -158,14 +159,14 @@ struct Paths {
         if (places.size() % RENEWED == 0) renew();
     }
 
-    FHASH_INLINE void renew() {
+    void renew() {
         Floats lowest = cost[0];
         for (const Floats& of : cost) lowest = of < lowest ? of : lowest;
         for (Floats& of : cost) of -= lowest;
     }
 
     // Go back along the best paths.
-    FHASH_INLINE void trace() {
+    void trace() {
         uint8_t before[STATES][2];
         for (int state = 0; state < STATES; state++)
             for (int odd = 0; odd < 2; odd++)
@@ -193,17 +194,12 @@ struct Paths {
     }
 };
 
-template <Mode MODE>
-using FlagWriter =
-    typename std::conditional<MODE == PRICE || MODE == GUESS, Counter, Encoder>::type;
+struct Writer : Lattice<Writer, FlagWriter> {
+    using Base = Lattice<Writer, FlagWriter>;
 
-template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
-    using Base = Lattice<Writer<MODE>, FlagWriter<MODE>>;
-    using Base::row, Base::all_rows, Base::place_of, Base::room_in;
-
-    static const bool CHOOSES = MODE != ENCODE;  // whether there are values
-    static const bool GUESSES = MODE == GUESS;
-    static const bool WRITES = MODE != PRICE && MODE != GUESS;
+    const Mode mode;
+    const bool has_values = mode != ENCODE;
+    const bool writes = mode != PRICE && mode != GUESS;
     const Task& task;
     Paths* const paths;
     uint32_t counts[SYMBOLS][LANES] = {};  // by lane, so that none waits for the one before
@@ -219,11 +215,12 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     Floats rests = {};  // sums of the squared errors of a row
     Ints given[2];      // of the block, by parity: values, as bits of floats, or integers
 
-    Writer(const Task& of, FlagWriter<MODE> flag_coder, Paths* through)
-        : Base(of.shape, of.prior, of.trellis, of.bands, flag_coder), task(of), paths(through) {}
+    Writer(const Task& of, Mode in, FlagWriter flag_coder, Paths* through)
+        : Base(of.shape, of.prior, of.trellis, of.trellis && in != GUESS, of.bands, flag_coder),
+          mode(in), task(of), paths(through) {}
 
-    FHASH_INLINE void run_all() {
-        if (MODE == PRICE || MODE == CHOOSE) weigh();
+    void run_all() {
+        if (mode == PRICE || mode == CHOOSE) weigh();
         Base::run();
         end_row();
     }
@@ -248,12 +245,12 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     }
 
     // The least values that are worth a symbol in a band.
-    FHASH_INLINE void weigh_band(int kind) {
+    void weigh_band(int kind) {
         const int context = Base::group_of(kind) * 2 * CLASSES * LEVELS;
-        least_near = MODE == GUESS ? GUESSED_ZERO : SMALLEST;
+        least_near = mode == GUESS ? GUESSED_ZERO : SMALLEST;
         least_far = least_near;
-        if (MODE == PRICE || MODE == CHOOSE) least_far = 1 + lower[in_context(context, 1)];
-        if (MODE == GUESS) {
+        if (mode == PRICE || mode == CHOOSE) least_far = 1 + lower[in_context(context, 1)];
+        if (mode == GUESS) {
             const float* const rates = paths->rates + context * Paths::RATES;
             least_far = max(1 + (rates[1] - rates[0]) / 4, least_near);
         }
@@ -262,7 +259,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     // Values of a block, or its integers, and zeros behind the end of a row.
     template <class Each> FHASH_INLINE void values_of(int64_t place, int room, Each each) const {
         static_assert(sizeof(float) == sizeof(int32_t), "either is a lane");
-        const char* from = CHOOSES ? reinterpret_cast<const char*>(task.values + place)
+        const char* from = has_values ? reinterpret_cast<const char*>(task.values + place)
                                    : reinterpret_cast<const char*>(task.q + place);
         Ints kept[2] = {};
         if (room < BLOCK) {
@@ -273,15 +270,15 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     }
     // Their magnitudes, in steps.
     FHASH_INLINE Floats sizes_of(Ints values) const {
-        if (!CHOOSES) return floats(values < 0 ? -values : values);
+        if (!has_values) return floats(values < 0 ? -values : values);
         const Floats scaled = (Floats)values * task.scale;
         return (Floats)((Ints)scaled & 0x7fffffff);
     }
 
     // Find out whether a band has integers, and how large they are.
-    FHASH_INLINE void look_at(Band& band) {
+    void look_at(Band& band) {
         const int blocks = band.blocks;
-        if constexpr (MODE == FOLLOW) {
+        if (mode == FOLLOW) {
             const Known known = paths->bands[(size_t)(&band - Base::bands.data())];
             band.any = known.any;
             band.shift = known.shift;
@@ -323,9 +320,9 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         band.any = count > 0;
         if (!band.any) squares += error;
         // On a trellis an index is two steps.
-        const double many = (double)MANY * (double)count * (MODE == GUESS ? 2 : 1);
+        const double many = (double)MANY * (double)count * (mode == GUESS ? 2 : 1);
         while (total > many * (1 << band.shift) && band.shift < MAX_SHIFT) band.shift++;
-        if constexpr (MODE == GUESS) {
+        if (mode == GUESS) {
             paths->bands[(size_t)(&band - Base::bands.data())] = {band.any, band.shift};
             marks = paths->marks.size();
             paths->marks.resize(marks + (size_t)(rows * blocks));
@@ -336,11 +333,11 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     FHASH_INLINE int some_in_row() {
         const int64_t first = row.number * row.blocks;
         for (int k = 0; k < row.blocks; k++) {
-            if (MODE == FOLLOW ? paths->marks[marks + (size_t)(first + k)] != 0
+            if (mode == FOLLOW ? paths->marks[marks + (size_t)(first + k)] != 0
                                : largest[(size_t)(first + k)] >= least_far)
                 return 1;
         }
-        if (MODE == FOLLOW || MODE == GUESS) return 0;
+        if (mode == FOLLOW || mode == GUESS) return 0;
         for (int k = 0; k < row.blocks; k++) leave_out(k);
         end_row();
         return 0;
@@ -348,17 +345,17 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     // The same of a block. is_near: whether there are others than zeros around it.
     FHASH_INLINE int some_in_block(int number, bool is_near) {
         const size_t at = (size_t)(row.number * row.blocks + number);
-        if (MODE == FOLLOW) return paths->marks[marks + at];
+        if (mode == FOLLOW) return paths->marks[marks + at];
         const int some = largest[at] >= (is_near ? least_near : least_far);
-        if (MODE == GUESS) paths->marks[marks + at] = (uint8_t)some;
-        if (some || MODE == GUESS) return some;
+        if (mode == GUESS) paths->marks[marks + at] = (uint8_t)some;
+        if (some || mode == GUESS) return some;
         leave_out(number);
         return 0;
     }
 
     // Count the errors of a block of zeros.
     FHASH_INLINE void leave_out(int number) {
-        if (!CHOOSES) return;
+        if (!has_values) return;
         values_of(row.place + BLOCK * number, room_in(number), [&](Ints a, Ints b) FHASH_LAMBDA {
             const Floats one = sizes_of(a), other = sizes_of(b);
             rests += one * one + other * other;
@@ -377,7 +374,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         });
     }
     FHASH_INLINE void end_block(const Half& even, const Half& odd, int number, int room) {
-        if constexpr (MODE == CHOOSE || MODE == FOLLOW)
+        if (mode == CHOOSE || mode == FOLLOW)
             Base::keep_integers(task.q, even, odd, number, room);
     }
 
@@ -404,14 +401,14 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
 
     FHASH_INLINE void code_half(Half& half, int parity) {
         const Ints values = given[parity];
-        if constexpr (MODE == GUESS) {
+        if (mode == GUESS) {
             half.magnitudes = guess(half, sizes_of(values));
             half.signs = Ints{};
             return;
         }
-        if constexpr (MODE == FOLLOW)
+        if (mode == FOLLOW)
             half.magnitudes = loaded<Ints>(paths->places[paths->taken++].indices);
-        else if (CHOOSES) half.magnitudes = choose(sizes_of(values), half.contexts);
+        else if (has_values) half.magnitudes = choose(sizes_of(values), half.contexts);
         else half.magnitudes = values < 0 ? -values : values;
         const Ints tokens = tokens_of(half.magnitudes >> half.low);
         write_step(half.contexts, tokens);
@@ -437,7 +434,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     FHASH_INLINE void write_step(Ints contexts, Ints symbols) {
         const Shorts step = __builtin_convertvector(contexts * TOKENS + symbols, Shorts);
         for (int i = 0; i < LANES; i++) counts[step[i]][i]++;
-        if (WRITES) steps.push_back(step);
+        if (writes) steps.push_back(step);
     }
 
     FHASH_INLINE void write_magnitude(int magnitude, int token, int low) {
@@ -448,14 +445,14 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
             const uint32_t rest = (uint32_t)(high - FIRST[LAST]) + (1u << LAST_BITS);
             const int length = significant(rest) - 1;
             bits += 2 * (length - LAST_BITS) + 1;
-            if (WRITES) {
+            if (writes) {
                 out.put(1ull << (length - LAST_BITS), length - LAST_BITS + 1);
                 out.put(rest & ((1u << length) - 1), length);
             }
-        } else if (WRITES && token >= DIRECT) {
+        } else if (writes && token >= DIRECT) {
             out.put((uint64_t)(high - FIRST[token]), token - DIRECT + 1);
         }
-        if (WRITES) out.put((uint64_t)magnitude & ((1ull << low) - 1), low);
+        if (writes) out.put((uint64_t)magnitude & ((1ull << low) - 1), low);
         raw += bits;
     }
 };
@@ -501,7 +498,7 @@ double choose_distributions(const uint32_t (*counts)[LANES], const Task& task, d
 }
 
 // The words of the lanes: the steps are coded backwards, so that they are read forwards.
-FHASH_INLINE void write_words(const std::vector<Shorts>& steps, const Prior& prior,
+void write_words(const std::vector<Shorts>& steps, const Prior& prior,
                               const uint8_t* chosen, std::vector<uint8_t>& bytes) {
     // x / slots is x * inverse >> 43, for all states x below slots << 21.
     struct Symbol {
@@ -550,26 +547,24 @@ void put_section(std::vector<uint8_t>& to, const std::vector<uint8_t>& section) 
     to.insert(to.end(), section.begin(), section.end());
 }
 
-template <Mode MODE>
-FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double* results,
-                           Paths* paths = nullptr) {
+int64_t write(Mode mode, const Task& task, std::vector<uint8_t>& bytes, double* results,
+              Paths* paths = nullptr) {
     std::vector<uint8_t> flag_bytes;
-    FlagWriter<MODE> flag_coder;
-    if constexpr (Writer<MODE>::WRITES) flag_coder.out = &flag_bytes;
-    const auto writer = std::make_unique<Writer<MODE>>(task, flag_coder, paths);
+    const FlagWriter flag_coder = {mode != PRICE && mode != GUESS, {&flag_bytes}, 0};
+    const auto writer = std::make_unique<Writer>(task, mode, flag_coder, paths);
     if (!read_bands(task.table, task.shape, writer->bands)) return -1;
     writer->run_all();
-    if constexpr (MODE == GUESS) return 0;
+    if (mode == GUESS) return 0;
     uint8_t chosen[CONTEXTS];
     results[0] = choose_distributions(writer->counts, task, (double)writer->raw, chosen);
     results[1] = writer->squares;
-    if constexpr (MODE == PRICE) results[0] += (double)writer->range.bits / 2048;
+    results[0] += (double)writer->range.bits / 2048;
     results[0] /= 8;
     bool some = false;  // then there are states of lanes
     for (const Band& band : writer->bands) some |= band.any;
     results[0] += some ? 4 * LANES : 0;
-    if constexpr (!Writer<MODE>::WRITES) return 0;
-    else writer->range.finish();
+    if (mode == PRICE) return 0;
+    writer->range.encoder.finish();
     BitsOut choices;
     bool any_chosen = false;  // in the group
     for (int context = 0; context < CONTEXTS; context++) {
@@ -594,34 +589,12 @@ FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double
 }
 
 // Write the integers of the best paths through the trellis.
-FHASH_INLINE int64_t write_paths(const Task& task, std::vector<uint8_t>& bytes, double* results) {
+int64_t write_paths(const Task& task, std::vector<uint8_t>& bytes, double* results) {
     Paths paths(task);
-    const int64_t code = write<GUESS>(task, bytes, results, &paths);
+    const int64_t code = write(GUESS, task, bytes, results, &paths);
     if (code < 0) return code;
     paths.trace();
-    return write<FOLLOW>(task, bytes, results, &paths);
+    return write(FOLLOW, task, bytes, results, &paths);
 }
 
 }  // namespace
-
-// See fast.cpp.
-int64_t FHASH_FAST(encode)(int32_t* q, const float* values, int64_t trellis, double scale,
-                           double weight, const int64_t* shape, const int32_t* table, int64_t count,
-                           const uint16_t* slots, const uint8_t* defaults, uint8_t* data,
-                           int64_t capacity, double* results) {
-    return guarded([&]() -> int64_t {
-        const Prior prior = {reinterpret_cast<const uint16_t(*)[TOKENS]>(slots), defaults, nullptr};
-        const SymbolBits bits(prior);
-        const Task task = {q,     values,        (float)scale, weight, shape,
-                           table, (size_t)count, prior,        bits,   trellis != 0};
-        std::vector<uint8_t> bytes;
-        const int64_t code = !q        ? write<PRICE>(task, bytes, results)
-                             : !values ? write<ENCODE>(task, bytes, results)
-                             : trellis ? write_paths(task, bytes, results)
-                                       : write<CHOOSE>(task, bytes, results);
-        if (code < 0) return code;
-        if ((int64_t)bytes.size() <= capacity && !bytes.empty())
-            std::memcpy(data, bytes.data(), bytes.size());
-        return (int64_t)bytes.size();
-    });
-}

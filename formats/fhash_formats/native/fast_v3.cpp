@@ -1,7 +1,6 @@
-// The fast coder for processors with AVX2 (fast.hpp).
-#if defined(__x86_64__)
-#define FHASH_FAST_V3
-#include "fast_decode.hpp"
-#include "fast_encode.hpp"
-FHASH_END_FAST
+// The fast coder for AVX2.
+#if defined(__x86_64__) && defined(__GNUC__)
+#define FHASH_TARGET 3
+#include "fast.cpp"
+FHASH_END_TARGET
 #endif

@@ -14,6 +14,7 @@
 
 #include "mixing.hpp"
 #include "rows.hpp"
+#include "target.hpp"
 
 namespace {
 
@@ -112,7 +113,7 @@ template <bool DECODES> struct LabelCoder {
 
     // Code the label of vertex x that is none of the first `tested` candidates, from its highest
     // bit on.
-    FHASH_INLINE int spell(int label, int x, const int* candidates, int tested) {
+    int spell(int label, int x, const int* candidates, int tested) {
         const int next = highest + 1;
         if (next < count && code_simple(range, state->simples[NEXT], label == next)) return next;
         int low = 0, node = 1, level = significant((uint32_t)(count - 1));
@@ -186,7 +187,7 @@ template <bool DECODES> struct LabelCoder {
     // For each vertex of a row from x to `end` - 1: which neighbours beside have the label in
     // `labels`. row: `at`, as pointers that the compiler knows not to change.
     // Returns those that do for all vertices.
-    FHASH_INLINE static uint16_t compare(int x, int end, const uint16_t* const* row,
+    static uint16_t compare(int x, int end, const uint16_t* const* row,
                                          const uint16_t* labels, uint16_t* sets) {
         uint16_t all = QUIET;
         FHASH_INDEPENDENT for (; x < end; x++) {
@@ -200,7 +201,7 @@ template <bool DECODES> struct LabelCoder {
     }
 
     // Look at the neighbours beside of a row of n vertices. row: see `compare`.
-    FHASH_INLINE void look(int n, const uint16_t* const* row) {
+    void look(int n, const uint16_t* const* row) {
         uint16_t* const other = others.data();
         for (int x0 = 0; x0 < n; x0 += BLOCK) {
             const int x1 = min(x0 + BLOCK, n);
@@ -231,7 +232,7 @@ template <bool DECODES> struct LabelCoder {
     }
 
     // Code all labels (t, z, y, x), each below `count`.
-    FHASH_INLINE void run(uint16_t* labels, const int64_t* shape) {
+    void run(uint16_t* labels, const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
         PaddedRows<uint16_t> known(shape, 0);
         for (auto* row : {&in_first, &others, &in_second}) row->resize((size_t)n3);
@@ -288,20 +289,6 @@ int bit_contexts(int64_t count) {
     return 256 << min(significant((uint32_t)(count - 1)), 8);
 }
 
-template <class Coder> FHASH_INLINE int64_t run_all(Coder& coder, uint16_t* labels,
-                                                    const int64_t* shape) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        coder.run(labels, shape);
-        return 0;
-    });
-}
-FHASH_CLONES int64_t encode(LabelCoder<false>& coder, uint16_t* labels, const int64_t* shape) {
-    return run_all(coder, labels, shape);
-}
-FHASH_CLONES int64_t decode(LabelCoder<true>& coder, uint16_t* labels, const int64_t* shape) {
-    return run_all(coder, labels, shape);
-}
-
 }  // namespace
 
 // Encode labels (t, z, y, x), each from 0 to `count` - 1; count is 1 to 65536. The labels are
@@ -310,14 +297,15 @@ FHASH_CLONES int64_t decode(LabelCoder<true>& coder, uint16_t* labels, const int
 // data: receives the bytes if they fit the capacity.
 //
 // Returns the number of bytes, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_encode_labels(uint16_t* labels, int64_t count, const int64_t* shape,
-                                         uint8_t* data, int64_t capacity) {
+FHASH_FOR_TARGETS(fhash_encode_labels,
+                  (uint16_t* labels, int64_t count, const int64_t* shape, uint8_t* data,
+                   int64_t capacity),
+                  (labels, count, shape, data, capacity)) {
     return guarded([&]() -> int64_t {
         const int size = bit_contexts(count);
         std::vector<uint8_t> out;
         LabelCoder<false> coder{{&out}, (int)count, size, blank_state(size)};
-        const int64_t code = encode(coder, labels, shape);
-        if (code < 0) return code;
+        coder.run(labels, shape);
         coder.range.finish();
         return put(out, data, capacity);
     });
@@ -327,11 +315,14 @@ FHASH_EXPORT int64_t fhash_encode_labels(uint16_t* labels, int64_t count, const 
 // below `count`.
 //
 // Returns 0 or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode_labels(uint16_t* labels, int64_t count, const int64_t* shape,
-                                         const uint8_t* data, int64_t size) {
+FHASH_FOR_TARGETS(fhash_decode_labels,
+                  (uint16_t* labels, int64_t count, const int64_t* shape, const uint8_t* data,
+                   int64_t size),
+                  (labels, count, shape, data, size)) {
     return guarded([&]() -> int64_t {
         const int contexts = bit_contexts(count);
         LabelCoder<true> coder{{data, size}, (int)count, contexts, blank_state(contexts)};
-        return decode(coder, labels, shape);
+        coder.run(labels, shape);
+        return 0;
     });
 }

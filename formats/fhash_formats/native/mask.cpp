@@ -11,6 +11,7 @@
 
 #include "mixing.hpp"
 #include "rows.hpp"
+#include "target.hpp"
 
 namespace {
 
@@ -56,7 +57,7 @@ template <bool DECODES> struct MaskCoder {
     }
 
     // Code all bits. mask, level, other, shape: as for fhash_encode_mask and fhash_decode_mask.
-    FHASH_INLINE void run(uint8_t* mask, const uint8_t* level, const uint8_t* other,
+    void run(uint8_t* mask, const uint8_t* level, const uint8_t* other,
                           const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
         const int segments = (n3 + SEGMENT - 1) / SEGMENT;
@@ -165,22 +166,6 @@ template <bool DECODES> struct MaskCoder {
     }
 };
 
-FHASH_CLONES int64_t encode(MaskCoder<false> coder, uint8_t* mask, const uint8_t* level,
-                            const uint8_t* other, const int64_t* shape) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        coder.run(mask, level, other, shape);
-        coder.range.finish();
-        return 0;
-    });
-}
-FHASH_CLONES int64_t decode(MaskCoder<true> coder, uint8_t* mask, const uint8_t* level,
-                            const uint8_t* other, const int64_t* shape) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        coder.run(mask, level, other, shape);
-        return 0;
-    });
-}
-
 }  // namespace
 
 // Encode a mask of zeros and ones (t, z, y, x).
@@ -191,18 +176,21 @@ FHASH_CLONES int64_t decode(MaskCoder<true> coder, uint8_t* mask, const uint8_t*
 // data: receives the bytes if they fit the capacity.
 //
 // Returns the number of bytes, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level,
-                                       const uint8_t* other, const int64_t* shape, uint16_t* slots,
-                                       int64_t slot_count, int32_t* weights, int64_t weight_count,
-                                       uint16_t* simples, int64_t simple_count, int64_t keep,
-                                       uint8_t* data, int64_t capacity) {
+FHASH_FOR_TARGETS(fhash_encode_mask,
+                  (const uint8_t* mask, const uint8_t* level, const uint8_t* other,
+                   const int64_t* shape, uint16_t* slots, int64_t slot_count, int32_t* weights,
+                   int64_t weight_count, uint16_t* simples, int64_t simple_count, int64_t keep,
+                   uint8_t* data, int64_t capacity),
+                  (mask, level, other, shape, slots, slot_count, weights, weight_count, simples,
+                   simple_count, keep, data, capacity)) {
     return guarded([&]() -> int64_t {
         State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
                                  LANES);
         // The run writes to its mask, also in encoding.
         std::vector<uint8_t> out, bits(mask, mask + shape[0] * shape[1] * shape[2] * shape[3]);
-        const int64_t code = encode({{&out}, &state}, bits.data(), level, other, shape);
-        if (code < 0) return code;
+        MaskCoder<false> coder{{&out}, &state};
+        coder.run(bits.data(), level, other, shape);
+        coder.range.finish();
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
         return size;
@@ -213,14 +201,17 @@ FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level
 // the caller must check a digest.
 //
 // Returns 0 or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode_mask(uint8_t* mask, const uint8_t* level, const uint8_t* other,
-                                       const int64_t* shape, const uint16_t* slots,
-                                       int64_t slot_count, const int32_t* weights,
-                                       int64_t weight_count, const uint16_t* simples,
-                                       int64_t simple_count, const uint8_t* data, int64_t size) {
+FHASH_FOR_TARGETS(fhash_decode_mask,
+                  (uint8_t* mask, const uint8_t* level, const uint8_t* other,
+                   const int64_t* shape, const uint16_t* slots, int64_t slot_count,
+                   const int32_t* weights, int64_t weight_count, const uint16_t* simples,
+                   int64_t simple_count, const uint8_t* data, int64_t size),
+                  (mask, level, other, shape, slots, slot_count, weights, weight_count, simples,
+                   simple_count, data, size)) {
     return guarded([&]() -> int64_t {
         State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
                                  LANES);
-        return decode({{data, size}, &state}, mask, level, other, shape);
+        MaskCoder<true>{{data, size}, &state}.run(mask, level, other, shape);
+        return 0;
     });
 }

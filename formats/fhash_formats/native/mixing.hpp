@@ -99,12 +99,15 @@ using std::uint8_t;
 
 using namespace fhash;
 
-// Stands for an Encoder where only the bits count, in 1/2048. It is here and not in
-// fast_encode.hpp, since `code_simple` is compiled for the baseline and inlines it.
-struct Counter {
-    int64_t bits = 0;
+// Encodes decisions, or counts their bits, in 1/2048. It is here and not in fast_encode.hpp, since
+// `code_simple` is compiled for the baseline and inlines it.
+struct FlagWriter {
+    bool writes;
+    Encoder encoder;
+    int64_t bits;
 
     FHASH_INLINE int code(int bit, uint32_t p) {
+        if (writes) return encoder.code(bit, p);
         bits += tables.cost[bit ? p : 65536 - p];
         return bit;
     }

@@ -16,6 +16,9 @@
 #include <cstdlib>
 #include <type_traits>
 
+#include "mixing.hpp"
+#include "target.hpp"
+
 #include "predict_rows.hpp"
 
 namespace {
@@ -53,7 +56,7 @@ template <bool DECODES> struct Pass : Rows {
 
     // Code by a flag whether a row differs from its predictions anywhere; if not, it becomes these.
     // q_row: where the row begins in the tile.
-    FHASH_INLINE int code_whole_row(Range& range, const PassPlan& plan, const Row& row, int32_t* q,
+    int code_whole_row(Range& range, const PassPlan& plan, const Row& row, int32_t* q,
                                     const uint8_t* counted, int64_t q_row, bool moved) {
         const int64_t n3 = N.n[3], stride = plan.stride[3];
         int differs = 0;
@@ -78,7 +81,7 @@ template <bool DECODES> struct Pass : Rows {
     }
 
     // Code a number from 1 on as an Exp-Golomb number; 0 for one that no encoder writes.
-    FHASH_INLINE uint32_t code_escape(Range& range, uint32_t rest) {
+    uint32_t code_escape(Range& range, uint32_t rest) {
         int bits = 0, j = 0;
         if (!DECODES) while (rest >> bits > 1) bits++;
         while (simple(range, j < bits, ESCAPES + min(j, 31))) if (++j > 28) return 0;
@@ -127,7 +130,7 @@ template <bool DECODES> struct Pass : Rows {
     }
 
     // Code all vertices of N. q, counted: of the whole tile. 0 or -1.
-    FHASH_INLINE int64_t run(const PassPlan& plan, int32_t* q, const uint8_t* counted) {
+    int64_t run(const PassPlan& plan, int32_t* q, const uint8_t* counted) {
         Range range = this->range;
         const int64_t n3 = N.n[3];
         const int kind = plan.kind;
@@ -205,7 +208,7 @@ template <bool DECODES> struct Pass : Rows {
     }
 
     // Join the two lattices, their vertices by turns along the axis, into C.
-    FHASH_INLINE void join(int axis) {
+    void join(int axis) {
         int64_t n[4] = {N.n[0], N.n[1], N.n[2], N.n[3]};
         n[axis] += C.n[axis];
         joined.size(n);
@@ -237,7 +240,7 @@ template <bool DECODES> struct Pass : Rows {
     }
 
     // Code all passes over a tile; arguments as for fhash_encode_predicted. 0 or -1.
-    FHASH_INLINE int64_t all(int32_t* q, const uint8_t* counted, const int64_t* shape,
+    int64_t all(int32_t* q, const uint8_t* counted, const int64_t* shape,
                              const int64_t* levels, const int32_t* passes, int64_t pass_count,
                              const int32_t* taps, const int16_t* weights) {
         const int64_t S[4] = {shape[1] * shape[2] * shape[3], shape[2] * shape[3], shape[3], 1};
@@ -271,23 +274,6 @@ template <bool DECODES> struct Pass : Rows {
     }
 };
 
-FHASH_CLONES int64_t encode(Pass<false>& pass, int32_t* q, const uint8_t* counted,
-                            const int64_t* shape, const int64_t* levels, const int32_t* passes,
-                            int64_t pass_count, const int32_t* taps, const int16_t* weights) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        const int64_t code = pass.all(q, counted, shape, levels, passes, pass_count, taps, weights);
-        pass.range.finish();
-        return code;
-    });
-}
-FHASH_CLONES int64_t decode(Pass<true>& pass, int32_t* q, const int64_t* shape,
-                            const int64_t* levels, const int32_t* passes, int64_t pass_count,
-                            const int32_t* taps, const int16_t* weights) {
-    return guarded([&]() FHASH_LAMBDA {
-        return pass.all(q, nullptr, shape, levels, passes, pass_count, taps, weights);
-    });
-}
-
 }  // namespace
 
 // Encode integers q (t, z, y, x), |q| <= 2^27.
@@ -301,22 +287,23 @@ FHASH_CLONES int64_t decode(Pass<true>& pass, int32_t* q, const int64_t* shape,
 // data: receives the bytes if they fit the capacity.
 //
 // Returns the number of bytes, or -1 where a value runs out of bounds, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_encode_predicted(int32_t* q, const uint8_t* counted,
-                                            const int64_t* shape, const int64_t* levels,
-                                            const int32_t* passes, int64_t pass_count,
-                                            const int32_t* taps, const int16_t* tap_weights,
-                                            const uint16_t* slots, int64_t slot_count,
-                                            const int32_t* weights, int64_t weight_count,
-                                            const uint16_t* simples, int64_t simple_count,
-                                            uint8_t* data, int64_t capacity) {
+FHASH_FOR_TARGETS(fhash_encode_predicted,
+                  (int32_t* q, const uint8_t* counted, const int64_t* shape,
+                   const int64_t* levels, const int32_t* passes, int64_t pass_count,
+                   const int32_t* taps, const int16_t* tap_weights, const uint16_t* slots,
+                   int64_t slot_count, const int32_t* weights, int64_t weight_count,
+                   const uint16_t* simples, int64_t simple_count, uint8_t* data, int64_t capacity),
+                  (q, counted, shape, levels, passes, pass_count, taps, tap_weights, slots,
+                   slot_count, weights, weight_count, simples, simple_count, data, capacity)) {
     return guarded([&]() -> int64_t {
         State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
                                  LANES);
         std::vector<uint8_t> out;
         Pass<false> pass{{&out}, &state};
         const int64_t code =
-            encode(pass, q, counted, shape, levels, passes, pass_count, taps, tap_weights);
+            pass.all(q, counted, shape, levels, passes, pass_count, taps, tap_weights);
         if (code < 0) return code;
+        pass.range.finish();
         return put(out, data, capacity);
     });
 }
@@ -324,17 +311,18 @@ FHASH_EXPORT int64_t fhash_encode_predicted(int32_t* q, const uint8_t* counted,
 // Decode integers into q; the other arguments are those of fhash_encode_predicted.
 //
 // Returns 0, or -1 for bytes that no encoder writes, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode_predicted(int32_t* q, const int64_t* shape, const int64_t* levels,
-                                            const int32_t* passes, int64_t pass_count,
-                                            const int32_t* taps, const int16_t* tap_weights,
-                                            const uint16_t* slots, int64_t slot_count,
-                                            const int32_t* weights, int64_t weight_count,
-                                            const uint16_t* simples, int64_t simple_count,
-                                            const uint8_t* data, int64_t size) {
+FHASH_FOR_TARGETS(fhash_decode_predicted,
+                  (int32_t* q, const int64_t* shape, const int64_t* levels, const int32_t* passes,
+                   int64_t pass_count, const int32_t* taps, const int16_t* tap_weights,
+                   const uint16_t* slots, int64_t slot_count, const int32_t* weights,
+                   int64_t weight_count, const uint16_t* simples, int64_t simple_count,
+                   const uint8_t* data, int64_t size),
+                  (q, shape, levels, passes, pass_count, taps, tap_weights, slots, slot_count,
+                   weights, weight_count, simples, simple_count, data, size)) {
     return guarded([&] {
         State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
                                  LANES);
         Pass<true> pass{{data, size}, &state};
-        return decode(pass, q, shape, levels, passes, pass_count, taps, tap_weights);
+        return pass.all(q, nullptr, shape, levels, passes, pass_count, taps, tap_weights);
     });
 }

@@ -22,7 +22,7 @@ struct Rows {
     std::vector<int64_t> wide;
 
     // Add a row of known differences, which begins at r in a lattice, moved along x, with weight w.
-    FHASH_INLINE void add_differences(Row& row, const Grid& G, int64_t r, int64_t offset, int w) {
+    void add_differences(Row& row, const Grid& G, int64_t r, int64_t offset, int w) {
         const int32_t* const p = G.errors.data() + r + offset;
         const int64_t first = max<int64_t>(0, -offset), last = min(N.n[3], G.n[3] - offset);
         int32_t* const to = known.data();
@@ -31,7 +31,7 @@ struct Rows {
     }
 
     // The base of a row, its slope and its step.
-    FHASH_INLINE void find_base(const PassPlan& plan, Row& row) {
+    void find_base(const PassPlan& plan, Row& row) {
         const int64_t n3 = N.n[3], t = row.t, z = row.z, y = row.y;
         const int axis = plan.axis;
         const int32_t* const V = row.values;
@@ -73,7 +73,7 @@ struct Rows {
 
     // The predictions of a row as far as they are known before it, and the activity of the taps
     // that are. Taps in the row itself are listed, and of their differences only the base counts.
-    template <bool NARROW> FHASH_INLINE void sum_taps(const PassPlan& plan, Row& row) {
+    template <bool NARROW> void sum_taps(const PassPlan& plan, Row& row) {
         const int64_t n3 = N.n[3], t = row.t, z = row.z, y = row.y;
         const int32_t* FHASH_RESTRICT const B = base.data();
         RowTap taps[MAX_TAPS];
@@ -118,7 +118,7 @@ struct Rows {
 
     // The same in 32 bits, TOGETHER vertices at a time: also where a tap does not exist, which is
     // taken back. What is read there does not matter, as numbers without a sign wrap around.
-    FHASH_INLINE void sum_narrow(const RowTap* taps, int count, int active, uint32_t own) {
+    void sum_narrow(const RowTap* taps, int count, int active, uint32_t own) {
         const int64_t n3 = N.n[3];
         uint32_t others = 0;  // weights of the taps that are not active
         for (int k = active; k < count; k++) others += (uint32_t)taps[k].weight;
@@ -162,7 +162,7 @@ struct Rows {
     }
 
     // All that is known of a row before its first vertex.
-    FHASH_INLINE void prepare(const PassPlan& plan, Row& row) {
+    void prepare(const PassPlan& plan, Row& row) {
         const int64_t n3 = N.n[3], t = row.t, z = row.z, y = row.y, r = N.row(t, z, y);
         for (std::vector<int32_t>* array : {&activity, &slope, &known})
             std::memset(array->data(), 0, 4 * (size_t)n3);
@@ -202,7 +202,7 @@ struct Rows {
     }
 
     // The same in the first lattice.
-    FHASH_INLINE int64_t predict_first(const PassPlan& plan, const Row& row, int64_t x) {
+    int64_t predict_first(const PassPlan& plan, const Row& row, int64_t x) {
         int32_t* const B = base.data();
         if (x > 0) B[x] = 2 * row.values[x - 1];
         int64_t p = (int64_t)B[x] * 4096;
@@ -220,14 +220,14 @@ struct Rows {
     }
 
     // Note the largest value of a row that is known now.
-    FHASH_INLINE void note_largest(const Row& row) {
+    void note_largest(const Row& row) {
         int32_t most = 0;
         for (int64_t x = 0; x < N.n[3]; x++) most = max(most, std::abs(row.values[x]));
         largest = max<int64_t>(largest, most);
     }
 
     // Shares in the contexts of the differences above, below, before and in C.
-    FHASH_INLINE void prepare_contexts(const PassPlan& plan, const Row& row) {
+    void prepare_contexts(const PassPlan& plan, const Row& row) {
         const int64_t n3 = N.n[3];
         std::memset(sizes.data(), 0, 4 * (size_t)n3);
         std::memset(signs.data(), 0, 4 * (size_t)n3);

@@ -81,7 +81,7 @@ template <class T> struct Guessed {
 // Write the magnitudes of all indices into the bands, with flags of their rows.
 // quantisers: receives the quantiser of each vertex.
 template <class Source>
-FHASH_INLINE void fill_bands(Source source, const int64_t* shape, std::vector<Band>& bands,
+void fill_bands(Source source, const int64_t* shape, std::vector<Band>& bands,
                              uint8_t* quantisers) {
     for (Band& band : bands) {
         const int64_t rows = (int64_t)band.size[0] * band.size[1] * band.size[2];
@@ -110,7 +110,7 @@ FHASH_INLINE void fill_bands(Source source, const int64_t* shape, std::vector<Ba
 }
 
 // The bucket of each vertex, by the weighted mean of the indices around it that a decoder knows.
-FHASH_INLINE void find_buckets(const int64_t* shape, const std::vector<Band>& bands,
+void find_buckets(const int64_t* shape, const std::vector<Band>& bands,
                                uint8_t* buckets) {
     int widest = 0;
     for (const Band& band : bands) widest = max(widest, band.size[3]);
@@ -256,7 +256,7 @@ struct Paths {
 #endif
 
 // Subtract the least cost, so that costs stay in 32 bits.
-FHASH_INLINE void renew(Paths& paths) {
+void renew(Paths& paths) {
     int32_t cost[STATES], least = UNREACHED;
     paths.get(cost);
     for (int32_t c : cost) least = min(least, c);
@@ -266,7 +266,7 @@ FHASH_INLINE void renew(Paths& paths) {
 
 // Extend the paths by a row of n coefficients. choices: receives what `Paths::step` returns.
 template <class T>
-FHASH_INLINE void extend(Paths& paths, const T* scaled, int n, const uint8_t* buckets,
+void extend(Paths& paths, const T* scaled, int n, const uint8_t* buckets,
                          const Rates* rates, uint8_t* choices) {
     for (int begin = 0; begin < n; begin += RENEWED) {
         const int end = min(begin + RENEWED, n);
@@ -298,7 +298,7 @@ const Backwards backwards;
 
 // The levels of the best path. choices: of all vertices, as `extend` wrote them.
 template <class T>
-FHASH_INLINE void trace(const Paths& paths, const T* scaled, const int64_t* shape,
+void trace(const Paths& paths, const T* scaled, const int64_t* shape,
                         const std::vector<Band>& bands, const uint8_t* buckets,
                         const Rates* rates, const uint8_t* choices, int32_t* levels) {
     int32_t cost[STATES];
@@ -330,7 +330,7 @@ FHASH_INLINE void trace(const Paths& paths, const T* scaled, const int64_t* shap
 }
 
 template <class T>
-FHASH_INLINE int64_t choose(const T* scaled, const int64_t* shape, const int32_t* table,
+int64_t choose(const T* scaled, const int64_t* shape, const int32_t* table,
                             int64_t count, const uint8_t* buckets, const int32_t* numbers,
                             int32_t* levels) {
     std::vector<Band> bands((size_t)count);
@@ -349,7 +349,7 @@ FHASH_INLINE int64_t choose(const T* scaled, const int64_t* shape, const int32_t
 
 // Find the buckets and count the indices of a source.
 template <class Source>
-FHASH_INLINE int64_t tally(Source source, const int64_t* shape, const int32_t* table, int64_t count,
+int64_t tally(Source source, const int64_t* shape, const int32_t* table, int64_t count,
                            uint8_t* buckets, int64_t* counts) {
     std::vector<Band> bands((size_t)count);
     if (!read_bands(table, shape, bands)) return -1;
@@ -369,40 +369,6 @@ FHASH_INLINE int64_t tally(Source source, const int64_t* shape, const int32_t* t
     return 0;
 }
 
-FHASH_CLONES int64_t tally_found(Found source, const int64_t* shape, const int32_t* table,
-                                 int64_t count, uint8_t* buckets, int64_t* counts) {
-    return guarded([&]() FHASH_LAMBDA {
-        return tally(source, shape, table, count, buckets, counts);
-    });
-}
-FHASH_CLONES int64_t tally_f32(Guessed<float> source, const int64_t* shape, const int32_t* table,
-                               int64_t count, uint8_t* buckets, int64_t* counts) {
-    return guarded([&]() FHASH_LAMBDA {
-        return tally(source, shape, table, count, buckets, counts);
-    });
-}
-FHASH_CLONES int64_t tally_f64(Guessed<double> source, const int64_t* shape, const int32_t* table,
-                               int64_t count, uint8_t* buckets, int64_t* counts) {
-    return guarded([&]() FHASH_LAMBDA {
-        return tally(source, shape, table, count, buckets, counts);
-    });
-}
-
-FHASH_CLONES int64_t choose_f32(const float* scaled, const int64_t* shape, const int32_t* table,
-                                int64_t count, const uint8_t* buckets, const int32_t* rates,
-                                int32_t* levels) {
-    return guarded([&]() FHASH_LAMBDA {
-        return choose(scaled, shape, table, count, buckets, rates, levels);
-    });
-}
-FHASH_CLONES int64_t choose_f64(const double* scaled, const int64_t* shape, const int32_t* table,
-                                int64_t count, const uint8_t* buckets, const int32_t* rates,
-                                int32_t* levels) {
-    return guarded([&]() FHASH_LAMBDA {
-        return choose(scaled, shape, table, count, buckets, rates, levels);
-    });
-}
-
 }  // namespace
 
 // Find the bucket of each vertex in the bands of a table, in coded order, and count the indices.
@@ -412,22 +378,29 @@ FHASH_CLONES int64_t choose_f64(const double* scaled, const int64_t* shape, cons
 // counts: zeros (2, BUCKETS, RATES); receives the numbers by quantiser, bucket and index.
 //
 // Returns 0, or -1 for a band beyond the shape, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_trellis_count(const int32_t* levels, const int64_t* shape,
-                                         const int32_t* table, int64_t count, uint8_t* buckets,
-                                         int64_t* counts) {
-    return tally_found({levels, 0}, shape, table, count, buckets, counts);
+FHASH_FOR_TARGETS(fhash_trellis_count,
+                  (const int32_t* levels, const int64_t* shape, const int32_t* table,
+                   int64_t count, uint8_t* buckets, int64_t* counts),
+                  (levels, shape, table, count, buckets, counts)) {
+    return guarded([&] { return tally(Found{levels, 0}, shape, table, count, buckets, counts); });
 }
 
 // The same for a guess of the indices. scaled: coefficients / step, magnitudes below 2^30.
-FHASH_EXPORT int64_t fhash_trellis_guess_f32(const float* scaled, const int64_t* shape,
-                                             const int32_t* table, int64_t count, uint8_t* buckets,
-                                             int64_t* counts) {
-    return tally_f32({scaled}, shape, table, count, buckets, counts);
+FHASH_FOR_TARGETS(fhash_trellis_guess_f32,
+                  (const float* scaled, const int64_t* shape, const int32_t* table, int64_t count,
+                   uint8_t* buckets, int64_t* counts),
+                  (scaled, shape, table, count, buckets, counts)) {
+    return guarded([&] {
+        return tally(Guessed<float>{scaled}, shape, table, count, buckets, counts);
+    });
 }
-FHASH_EXPORT int64_t fhash_trellis_guess_f64(const double* scaled, const int64_t* shape,
-                                             const int32_t* table, int64_t count, uint8_t* buckets,
-                                             int64_t* counts) {
-    return tally_f64({scaled}, shape, table, count, buckets, counts);
+FHASH_FOR_TARGETS(fhash_trellis_guess_f64,
+                  (const double* scaled, const int64_t* shape, const int32_t* table,
+                   int64_t count, uint8_t* buckets, int64_t* counts),
+                  (scaled, shape, table, count, buckets, counts)) {
+    return guarded([&] {
+        return tally(Guessed<double>{scaled}, shape, table, count, buckets, counts);
+    });
 }
 
 // Choose the levels of the cheapest path.
@@ -438,15 +411,15 @@ FHASH_EXPORT int64_t fhash_trellis_guess_f64(const double* scaled, const int64_t
 // levels: zeros (t, z, y, x); receives the levels.
 //
 // Returns 0, or -1 for a band beyond the shape, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_trellis_choose_f32(const float* scaled, const int64_t* shape,
-                                              const int32_t* table, int64_t count,
-                                              const uint8_t* buckets, const int32_t* rates,
-                                              int32_t* levels) {
-    return choose_f32(scaled, shape, table, count, buckets, rates, levels);
+FHASH_FOR_TARGETS(fhash_trellis_choose_f32,
+                  (const float* scaled, const int64_t* shape, const int32_t* table, int64_t count,
+                   const uint8_t* buckets, const int32_t* rates, int32_t* levels),
+                  (scaled, shape, table, count, buckets, rates, levels)) {
+    return guarded([&] { return choose(scaled, shape, table, count, buckets, rates, levels); });
 }
-FHASH_EXPORT int64_t fhash_trellis_choose_f64(const double* scaled, const int64_t* shape,
-                                              const int32_t* table, int64_t count,
-                                              const uint8_t* buckets, const int32_t* rates,
-                                              int32_t* levels) {
-    return choose_f64(scaled, shape, table, count, buckets, rates, levels);
+FHASH_FOR_TARGETS(fhash_trellis_choose_f64,
+                  (const double* scaled, const int64_t* shape, const int32_t* table,
+                   int64_t count, const uint8_t* buckets, const int32_t* rates, int32_t* levels),
+                  (scaled, shape, table, count, buckets, rates, levels)) {
+    return guarded([&] { return choose(scaled, shape, table, count, buckets, rates, levels); });
 }

@@ -1,0 +1,6 @@
+// The mixing coder for AVX2.
+#if defined(__x86_64__) && defined(__GNUC__)
+#define FHASH_TARGET 3
+#include "coder.cpp"
+FHASH_END_TARGET
+#endif

@@ -1,0 +1,6 @@
+// Coding by prediction for AVX2.
+#if defined(__x86_64__) && defined(__GNUC__)
+#define FHASH_TARGET 3
+#include "predict.cpp"
+FHASH_END_TARGET
+#endif

@@ -1,0 +1,6 @@
+// The choice of integers on a trellis for AVX2.
+#if defined(__x86_64__) && defined(__GNUC__)
+#define FHASH_TARGET 3
+#include "trellis.cpp"
+FHASH_END_TARGET
+#endif
