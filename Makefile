@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units docs notebooks hard every results device lib paraview wheels wasm view clean
+.PHONY: demo test types units docs notebooks hard every results device lib paraview compile-times wheels wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
@@ -76,6 +76,10 @@ wheels: .venv/.stamp $(PLATFORMS:%=wheel/%)
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	$(BIN)/python -m build --no-isolation --wheel --outdir dist benchmarks
 	ls -l dist
+
+# CPU seconds of each unit that the compiler takes, one after the other; tests hold the sizes of objects.
+compile-times: .venv/.plain
+	$(BIN)/python setup.py -q compile_times
 
 # The decoder in the page of `fhash view`, which is committed: fhash_codec/views/page/fhash.wasm. Debian: clang-14, lld-14, wasi-libc,
 # libc++-14-dev-wasm32, libc++abi-14-dev-wasm32, libclang-rt-14-dev-wasm32.

@@ -35,9 +35,10 @@ TARGET = os.environ.get("FHASH_TARGET", "")
 
 # No contraction into fused multiply-adds and no fast-math: a stream must decode to the same bits on
 # every machine. That nothing traps, and loops marked as independent, change no bit; without them
-# the compiler does not vectorise the marcher.
+# the compiler does not vectorise the marcher. Sources of loops ask for more than -O2 (loops.hpp,
+# target.hpp).
 GNU_FLAGS = [
-    "-O3",
+    "-O2",
     "-std=c++17",
     "-ffp-contract=off",
     "-fno-math-errno",
@@ -70,9 +71,12 @@ THIRD_PARTY: list[tuple[str, str | None]] = [
     ("ZSTDERRORLIB_VISIBLE", ""),
     ("ZSTD_DISABLE_ASM", "1"),
     ("ZSTD_TRACE", "0"),
+    ("YYJSON_DISABLE_NON_STANDARD", "1"),
+    ("YYJSON_DISABLE_UTILS", "1"),
     ("FHASH_BUILDING", "1"),
 ]
-"""Definitions by which a library exports nothing of third_party, but its own public functions."""
+"""Definitions by which a library exports nothing of third_party, but its own public functions, and
+has little of third_party that nobody calls."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 
@@ -93,8 +97,6 @@ WASM_FLAGS = [
 WASM_SMALL = [
     ("HUF_FORCE_DECOMPRESS_X1", "1"),
     ("ZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT", "1"),
-    ("YYJSON_DISABLE_NON_STANDARD", "1"),
-    ("YYJSON_DISABLE_UTILS", "1"),
     ("YYJSON_DISABLE_FAST_FP_CONV", "1"),
     ("yyjson_inline", "inline"),
 ]
@@ -142,19 +144,25 @@ class BuildNative(build_ext):
             if self.compiler.compiler_type != "msvc":  # that one initialises itself on the way
                 self._compile_in(pool)
             self._build_extensions()
+        if self.compiler.compiler_type != "msvc":
+            self._keep_sizes()
 
     def _compile_in(self, pool: ThreadPoolExecutor) -> None:
         compile_some = self.compiler.compile
+        self.objects = []
 
         def compile_one(source: str, extra_postargs: list[str], **options: Any) -> list[str]:
             if source.endswith(".c"):  # of others: C, and its warnings are theirs
                 own = [flag for flag in extra_postargs if not flag.startswith("-std=")]
-                extra_postargs = [*own, "-w"]
+                # Documents are small: -O1 is compiled in half of the time.
+                extra_postargs = [*own, "-w", *(["-O1"] if "yyjson" in source else [])]
             return list(compile_some([source], extra_postargs=extra_postargs, **options))
 
         def compile_each(sources: list[str], **options: Any) -> list[str]:
             jobs = [pool.submit(compile_one, source, **options) for source in sources]
-            return [path for job in jobs for path in job.result()]
+            made = [path for job in jobs for path in job.result()]
+            self.objects += made
+            return made
 
         self.compiler.compile = compile_each
 
@@ -167,6 +175,13 @@ class BuildNative(build_ext):
                 f"fhash needs a C++17 compiler, and '{named[0]}' did not build it: {error}"
             ) from error
 
+    def _keep_sizes(self) -> None:
+        """Write the bytes of each object to build/objects.json: a test holds them to a limit, since
+        the time of a compiler is that of the code that it makes."""
+        sizes = {Path(path).name: os.path.getsize(path) for path in self.objects}
+        Path("build").mkdir(exist_ok=True)
+        Path("build/objects.json").write_text(json.dumps(sizes, indent=1), "utf-8")
+
     def _build_with_flags(self) -> None:
         for extension in self.extensions:
             msvc = self.compiler.compiler_type == "msvc"
@@ -174,6 +189,37 @@ class BuildNative(build_ext):
             extension.extra_compile_args = MSVC_FLAGS if msvc else [*GNU_FLAGS, *own]
             extension.extra_link_args = [] if msvc else [*GNU_LINK_FLAGS, *links]
         super().build_extensions()
+
+
+class CompileTimes(BuildNative):
+    """`compile_times`: the CPU seconds of each unit, one after the other, in a folder of its own."""
+
+    description = "print the CPU seconds of each source"
+
+    def finalize_options(self) -> None:
+        self.build_lib, self.build_temp = "build/times/lib", "build/times/temp"
+        self.force, self.parallel = True, None
+        super().finalize_options()
+
+    def build_extensions(self) -> None:
+        seconds: dict[str, float] = {}
+        with ThreadPoolExecutor(1) as pool:
+            self._compile_in(pool)
+            compile_each = self.compiler.compile
+
+            def timed(sources: list[str], **options: Any) -> list[str]:
+                made = []
+                for source in sources:
+                    before = sum(os.times()[2:4])
+                    made += compile_each([source], **options)
+                    seconds[source] = sum(os.times()[2:4]) - before
+                return made
+
+            self.compiler.compile = timed
+            self._build_extensions()
+        for source, taken in sorted(seconds.items(), key=lambda row: row[1], reverse=True):
+            print(f"{taken:7.2f}  {source}")
+        print(f"{sum(seconds.values()):7.2f}  CPU s in all")
 
 
 class PlainWheel(bdist_wheel):
@@ -199,7 +245,8 @@ class BuildWasm(Command):
         build = Path("build/wasm")
         build.mkdir(parents=True, exist_ok=True)
         every = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
-        sources = [source for source in every if source.name != "hdf5_filter.cpp"]
+        others = ("hdf5_filter.cpp", *(path.name for path in FORMATS.glob("files/*.cpp")))
+        sources = [source for source in every if source.name not in others]
         headers = max(path.stat().st_mtime for path in [*FORMATS.rglob("*.h*"), Path(__file__)])
 
         def compiled(source: Path) -> Path:
@@ -269,6 +316,11 @@ setup(
         native("fhash_codec.native._codec", CODEC, flags=("-pthread",)),
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
-    cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel, "wasm": BuildWasm},
+    cmdclass={
+        "build_ext": BuildNative,
+        "bdist_wheel": PlainWheel,
+        "wasm": BuildWasm,
+        "compile_times": CompileTimes,
+    },
     options={"build_ext": {"parallel": 3}},
 )

@@ -1,6 +1,8 @@
 // Products of the lines of a tile along an axis, from which the data's own bases are made.
 // Each product of two places is added up line after line, so that every machine gets the same bits,
 // and no library for matrices starts threads of its own.
+#include "loops.hpp"
+
 #include <algorithm>
 #include <cfloat>
 #include <cmath>

@@ -1,5 +1,7 @@
 // Inputs of the neighbourhood head for voxels drawn from a tile. compact/head_training.py
 // states where they go; they are the numbers that head.cpp of fhash_formats computes.
+#include "loops.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

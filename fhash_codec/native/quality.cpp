@@ -4,6 +4,8 @@
 // fhash_scan and fhash_errors add in a stated order, so that every machine gets the same bits:
 // value i of a piece of PIECE values goes to lane i % LANES; the lanes are added up in order, then
 // the pieces.
+#include "loops.hpp"
+
 #include <algorithm>
 #include <cfloat>
 #include <cmath>

@@ -1,5 +1,7 @@
 // Training of the neighbourhood head: Adam on the squared errors of batches of voxels.
 // compact/head_training.py states the arithmetic.
+#include "loops.hpp"
+
 #include <atomic>
 #include <memory>
 #include <system_error>

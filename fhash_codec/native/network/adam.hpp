@@ -10,7 +10,7 @@ namespace {
 
 // Write numbers as they are after the missed steps. `to` may be `from`.
 template <class P>
-FHASH_INLINE void catch_up(float* to, const float* from, const float* FHASH_RESTRICT mean,
+void catch_up(float* to, const float* from, const float* FHASH_RESTRICT mean,
                            const float* FHASH_RESTRICT square, std::int64_t count, const Gap& gap) {
     const float factor = gap.factor, epsilon = gap.epsilon;
     FHASH_INDEPENDENT for (std::int64_t i = 0; i < count; i++)
@@ -27,7 +27,7 @@ struct Step {
 
 // Do a step on numbers that are caught up, and whose moments are not yet.
 template <class P>
-FHASH_INLINE void adam(float* FHASH_RESTRICT number, float* FHASH_RESTRICT mean,
+void adam(float* FHASH_RESTRICT number, float* FHASH_RESTRICT mean,
                        float* FHASH_RESTRICT square, const float* FHASH_RESTRICT gradient,
                        std::int64_t count, const Gap& gap, const Step& step) {
     const float b1 = (float)(BETA1 * gap.mean_decay), b2 = (float)(BETA2 * gap.square_decay);

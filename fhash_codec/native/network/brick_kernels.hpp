@@ -1,4 +1,4 @@
-// The kernels of the brick engine for one path (FHASH_ONLY, see vector.hpp): training and
+// The kernels of the brick engine for one path (FHASH_TARGET): training and
 // evaluation of the paper's network, a brick at a time. Upsampling, MLP forward and backward, the
 // transpose, and Adam of the finest embeddings follow each other while a brick lies in the cache.
 //
@@ -68,7 +68,7 @@ template <class P> struct Thread {
 };
 
 template <class P>
-FHASH_INLINE Thread<P> thread_of(const FhashBricks& b, std::int64_t thread, const float* flat) {
+Thread<P> thread_of(const FhashBricks& b, std::int64_t thread, const float* flat) {
     const std::int64_t inputs = input_rows(b);
     Thread<P> t{b, Work::of<P>(b, b.work + thread * b.work_size),
                 Mlp{inputs, b.hidden, b.width, {}, {}, {}, {}, nullptr}, inputs, vertices_of(b)};
@@ -81,7 +81,7 @@ FHASH_INLINE Thread<P> thread_of(const FhashBricks& b, std::int64_t thread, cons
 }
 
 // Write where the runs of a brick's samples begin and end; return the number of runs.
-template <class P> FHASH_INLINE std::int64_t runs_of(const Thread<P>& t, std::int64_t brick) {
+template <class P> std::int64_t runs_of(const Thread<P>& t, std::int64_t brick) {
     const std::uint8_t* bits = t.b.mask + brick * t.b.mask_bytes;
     std::int64_t edges = 0;
     std::uint64_t last = 0;  // whether the vertex before is a sample
@@ -103,12 +103,12 @@ template <class P> FHASH_INLINE std::int64_t runs_of(const Thread<P>& t, std::in
 }
 
 // Write zeros behind some numbers to the end of a vector.
-template <class P> FHASH_INLINE void fill_vector(float* row, std::int64_t count) {
+template <class P> void fill_vector(float* row, std::int64_t count) {
     for (; count % P::N; count++) row[count] = 0;
 }
 
 // Copy runs of the numbers of a row side by side, and zeros behind them to the end of a vector.
-template <class P> FHASH_INLINE void pick(const Thread<P>& t, std::int64_t runs, const float* from,
+template <class P> void pick(const Thread<P>& t, std::int64_t runs, const float* from,
                                           float* to) {
     std::int64_t at = 0;
     for (std::int64_t n = 0; n < runs; n++) {
@@ -121,7 +121,7 @@ template <class P> FHASH_INLINE void pick(const Thread<P>& t, std::int64_t runs,
 }
 
 // Copy them back, with zeros between them. What a vector writes too much is written again.
-template <class P> FHASH_INLINE void put_back(const Thread<P>& t, std::int64_t runs,
+template <class P> void put_back(const Thread<P>& t, std::int64_t runs,
                                               const float* from, float* to) {
     const typename P::F zero = {};
     std::int64_t at = 0, end = 0;
@@ -143,7 +143,7 @@ inline std::int64_t fine_at(const FhashBricks& b, std::int64_t brick, std::int64
 // Write the inputs at the samples of a brick, and return their rows: those of all vertices where
 // all are samples. `flat` holds the coarse tables, caught up.
 template <class P>
-FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap& gap,
+float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap& gap,
                               const float* flat, std::int64_t samples, std::int64_t* run_count) {
     const FhashBricks& b = t.b;
     const std::int64_t row = t.w.row;
@@ -176,7 +176,7 @@ FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap&
 }
 
 // Chunks of nearly equal length: some vectors of samples each.
-template <class P, class Work> FHASH_INLINE void in_chunks(std::int64_t samples, Work work) {
+template <class P, class Work> void in_chunks(std::int64_t samples, Work work) {
     const std::int64_t vectors = (samples + P::N - 1) / P::N;
     const std::int64_t chunks = (vectors + Tiles<P>::CHUNK - 1) / Tiles<P>::CHUNK;
     for (std::int64_t c = 0; c < chunks; c++) {
@@ -187,7 +187,7 @@ template <class P, class Work> FHASH_INLINE void in_chunks(std::int64_t samples,
 
 // Replace the inputs of samples by the gradients by them; return the sum of squared errors.
 template <class P>
-FHASH_INLINE double backpropagate(Thread<P>& t, float* rows, const float* target,
+double backpropagate(Thread<P>& t, float* rows, const float* target,
                                   std::int64_t samples) {
     double error = 0;
     const float scale = (float)t.b.scale;
@@ -214,7 +214,7 @@ FHASH_INLINE double backpropagate(Thread<P>& t, float* rows, const float* target
 }
 
 // The share of a thread in the bricks of a training step.
-template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t thread) {
+template <class P> void train(const FhashBricks& b, std::int64_t thread) {
     Thread<P> t = thread_of<P>(b, thread, b.flat);
     const Part part(b.count, thread, b.threads);
     const Step step(b);
@@ -254,7 +254,7 @@ template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t th
 }
 
 // The share of a thread in the bricks to be evaluated.
-template <class P> FHASH_INLINE void infer(const FhashBricks& b, std::int64_t thread) {
+template <class P> void infer(const FhashBricks& b, std::int64_t thread) {
     Thread<P> t = thread_of<P>(b, thread, b.current);
     const Part part(b.count, thread, b.threads);
     for (std::int64_t i = part.first; i < part.stop; i++) {
@@ -278,7 +278,7 @@ inline std::int64_t length_of(const FhashBricks& b, std::int64_t block) {
 
 // The share of a thread in the touched blocks, which catch up to the step before.
 template <class P>
-FHASH_INLINE void catch_up_blocks(const FhashBricks& b, std::int64_t thread) {
+void catch_up_blocks(const FhashBricks& b, std::int64_t thread) {
     const Part part(b.touches, thread, b.threads);
     for (std::int64_t i = part.first; i < part.stop; i++) {
         const std::int64_t block = b.touched[i], at = block * FHASH_BLOCK;
@@ -291,7 +291,7 @@ FHASH_INLINE void catch_up_blocks(const FhashBricks& b, std::int64_t thread) {
 
 // Do a step on some flat numbers, whose gradients are summed over the threads.
 template <class P, int MOST>
-FHASH_INLINE void move(const FhashBricks& b, std::int64_t at, std::int64_t count, const Gap& gap,
+void move(const FhashBricks& b, std::int64_t at, std::int64_t count, const Gap& gap,
                        const Step& step) {
     float sum[MOST] = {};
     for (std::int64_t t = 0; t < b.threads; t++) {
@@ -303,7 +303,7 @@ FHASH_INLINE void move(const FhashBricks& b, std::int64_t at, std::int64_t count
 }
 
 // The share of a thread in Adam of the flat numbers: the touched blocks, and all behind the blocks.
-template <class P> FHASH_INLINE void adam_of_flat(const FhashBricks& b, std::int64_t thread) {
+template <class P> void adam_of_flat(const FhashBricks& b, std::int64_t thread) {
     const Step step(b);
     const Part part(b.touches, thread, b.threads);
     for (std::int64_t i = part.first; i < part.stop; i++) {
@@ -326,7 +326,7 @@ template <class P> FHASH_INLINE void adam_of_flat(const FhashBricks& b, std::int
 
 // The share of a thread in a part of a step.
 template <class P>
-FHASH_INLINE std::int64_t run(const FhashBricks& b, std::int64_t part, std::int64_t thread) {
+std::int64_t run(const FhashBricks& b, std::int64_t part, std::int64_t thread) {
     switch (part) {
         case CATCH_UP: catch_up_blocks<P>(b, thread); return 0;
         case TRAIN: train<P>(b, thread); return 0;
@@ -348,4 +348,14 @@ FHASH_INLINE std::int64_t run(const FhashBricks& b, std::int64_t part, std::int6
     }                                                                                          \
     std::int64_t fhash_bricks_work_##NAME(const FhashBricks& b) {                              \
         return Work::of<PATH>(b, nullptr).size;                                                \
+    } \
+    namespace fhash_points {                                                                   \
+    std::int64_t run_##NAME(const Task& task, const Points& points, std::int64_t count,        \
+                            float* values, float* slopes, float* by_inputs) {                  \
+        return points_kernel<PATH>(task, points, count, values, slopes, by_inputs);            \
+    }                                                                                          \
+    std::int64_t still_##NAME(const Level& level, const std::int64_t* sizes, double time,      \
+                              std::int64_t count, float* still) {                              \
+        return still_kernel(level, sizes, time, count, still);                                 \
+    }                                                                                          \
     }

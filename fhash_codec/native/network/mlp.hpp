@@ -40,7 +40,7 @@ struct Product {
 };
 
 template <class P, int J, int R>
-FHASH_INLINE void product_tile(const Product& p, std::int64_t j, std::int64_t at) {
+void product_tile(const Product& p, std::int64_t j, std::int64_t at) {
     typedef typename P::F F;
     const F zero = {};
     F a[J][R];
@@ -83,7 +83,7 @@ FHASH_INLINE void product_tile(const Product& p, std::int64_t j, std::int64_t at
 }
 
 // All outputs of R vectors of samples, in tiles as equal as they can be.
-template <class P, int R> FHASH_INLINE void product_column(const Product& p, std::int64_t at) {
+template <class P, int R> void product_column(const Product& p, std::int64_t at) {
     constexpr int MOST = Tiles<P>::OUTPUTS;
     const std::int64_t tiles = (p.outputs + MOST - 1) / MOST;
     for (std::int64_t tile = 0; tile < tiles; tile++) {
@@ -100,7 +100,7 @@ template <class P, int R> FHASH_INLINE void product_column(const Product& p, std
     }
 }
 
-template <class P> FHASH_INLINE void product(const Product& p, std::int64_t vectors) {
+template <class P> void product(const Product& p, std::int64_t vectors) {
     constexpr int R = Tiles<P>::VECTORS;
     std::int64_t r = 0;
     for (; r + R <= vectors; r += R) product_column<P, R>(p, r * P::N);
@@ -117,7 +117,7 @@ struct Outer {
 };
 
 template <class P, int J, int K>
-FHASH_INLINE void outer_tile(const Outer& o, std::int64_t j, std::int64_t k, std::int64_t vectors) {
+void outer_tile(const Outer& o, std::int64_t j, std::int64_t k, std::int64_t vectors) {
     typedef typename P::F F;
     F a[J][K];
     float* sums = o.sums + (j * o.inputs + k) * P::N;
@@ -140,7 +140,7 @@ FHASH_INLINE void outer_tile(const Outer& o, std::int64_t j, std::int64_t k, std
 }
 
 template <class P, int J>
-FHASH_INLINE void outer_rows(const Outer& o, std::int64_t j, std::int64_t vectors) {
+void outer_rows(const Outer& o, std::int64_t j, std::int64_t vectors) {
     constexpr int MOST = Tiles<P>::INPUTS;
     const std::int64_t tiles = (o.inputs + MOST - 1) / MOST;
     for (std::int64_t tile = 0; tile < tiles; tile++) {
@@ -157,7 +157,7 @@ FHASH_INLINE void outer_rows(const Outer& o, std::int64_t j, std::int64_t vector
     }
 }
 
-template <class P> FHASH_INLINE void outer(const Outer& o, std::int64_t vectors) {
+template <class P> void outer(const Outer& o, std::int64_t vectors) {
     constexpr int J = Tiles<P>::NEURONS;
     std::int64_t j = 0;
     for (; j + J <= o.neurons; j += J) outer_rows<P, J>(o, j, vectors);
@@ -189,7 +189,7 @@ struct Mlp {
         return numbers;
     }
 
-    template <class P> FHASH_INLINE void lay_out(const float* layers, float* memory) {
+    template <class P> void lay_out(const float* layers, float* memory) {
         constexpr std::int64_t CHUNK = Tiles<P>::CHUNK * P::N;
         const auto take = [&memory](std::int64_t numbers) FHASH_LAMBDA {
             float* const taken = memory;
@@ -209,7 +209,7 @@ struct Mlp {
     }
 
     // Begin a step: no sums yet, weights for the way back.
-    template <class P> FHASH_INLINE void begin() {
+    template <class P> void begin() {
         for (std::int64_t n = 0; n <= hidden; n++)
             std::memset(sums[n], 0, numbers_of(n) * P::BYTES);
         for (std::int64_t n = 0; n < hidden; n++) {
@@ -227,7 +227,7 @@ struct Mlp {
 
     // Write the outputs of some vectors of samples into `value`. in: rows `row` numbers apart.
     template <class P>
-    FHASH_INLINE void forward(const float* in, std::int64_t row, std::int64_t vectors, bool keep) {
+    void forward(const float* in, std::int64_t row, std::int64_t vectors, bool keep) {
         constexpr std::int64_t CHUNK = Tiles<P>::CHUNK * P::N;
         const typename P::F bias = all<P>(layer[hidden][inputs_of(hidden)]);
         for (std::int64_t r = 0; r < vectors; r++) store<P>(value + r * P::N, bias);
@@ -251,7 +251,7 @@ struct Mlp {
     // Replace inputs by the gradients by them, after `forward` with `keep` and with the gradients
     // by the outputs in `value`. The row behind the inputs holds ones, and stays.
     template <class P>
-    FHASH_INLINE void backward(float* in, std::int64_t row, std::int64_t vectors) {
+    void backward(float* in, std::int64_t row, std::int64_t vectors) {
         constexpr std::int64_t CHUNK = Tiles<P>::CHUNK * P::N;
         typedef typename P::F F;
         const F zero = {};
@@ -282,7 +282,7 @@ struct Mlp {
     }
 
     // Write the gradient by all layers, after all samples of a step.
-    template <class P> FHASH_INLINE void gradient(float* to) const {
+    template <class P> void gradient(float* to) const {
         const auto total = [](const float* vector) FHASH_LAMBDA {
             float sum = 0;
             for (int i = 0; i < P::N; i++) sum += vector[i];

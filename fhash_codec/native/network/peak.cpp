@@ -33,13 +33,13 @@ constexpr int CHAINS = 12;
         return 2 * CHAINS * P::N * rounds;                                                         \
     }
 FMA(, fma_v1, Path1)
-#if defined(FHASH_THREE_PATHS)
-FMA(FHASH_V3, fma_v3, Path2)
-FMA(FHASH_V4, fma_v4, Path4)
+#if defined(FHASH_TARGETS)
+FMA(__attribute__((target(FHASH_FEATURES_3))), fma_v3, Path2)
+FMA(__attribute__((target(FHASH_FEATURES_4))), fma_v4, Path4)
 #endif
 
 std::int64_t fma(std::int64_t path, std::int64_t rounds) {
-#if defined(FHASH_THREE_PATHS)
+#if defined(FHASH_TARGETS)
     if (path == FHASH_PATH_V4) return fma_v4(rounds);
     if (path == FHASH_PATH_V3) return fma_v3(rounds);
 #endif

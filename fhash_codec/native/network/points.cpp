@@ -1,24 +1,33 @@
-// Exported function of points.hpp.
+// The network at scattered points: the functions that Python and the marcher call.
 #include "points.hpp"
 
-#include "guard.hpp"
-
 #include <vector>
+
+#include "guard.hpp"
 
 #if defined(FHASH_VECTORS)
 namespace {
 
+using namespace fhash_points;
+
 // Numbers that describe a level.
 constexpr std::int64_t LEVEL = 2 + 3 * AXES + 4;
 
-FHASH_PATHS(std::int64_t, points,
-            (const Task& task, const Points& places, std::int64_t count, float* values,
-             float* slopes, float* by_inputs),
-            (task, places, count, values, slopes, by_inputs))
-FHASH_PATHS(std::int64_t, still,
-            (const Level& level, const std::int64_t* sizes, double time, std::int64_t count,
-             float* numbers),
-            (level, sizes, time, count, numbers))
+// The kernels of a path.
+decltype(&run_v1) points(std::int64_t path) {
+#if defined(FHASH_TARGETS)
+    if (path == FHASH_PATH_V4) return run_v4;
+    if (path == FHASH_PATH_V3) return run_v3;
+#endif
+    return run_v1;
+}
+decltype(&still_v1) still(std::int64_t path) {
+#if defined(FHASH_TARGETS)
+    if (path == FHASH_PATH_V4) return still_v4;
+    if (path == FHASH_PATH_V3) return still_v3;
+#endif
+    return still_v1;
+}
 
 // A level of an array: address, numbers, three numbers for each axis, and the bitmap.
 Level level_at(const int64_t* given) {

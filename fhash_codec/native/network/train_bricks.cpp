@@ -19,7 +19,7 @@ bool is_sound(const FhashBricks& b) {
 
 // Do the share of a thread in a part.
 int64_t share(const FhashBricks& b, int64_t part, int64_t thread) {
-#if defined(FHASH_THREE_PATHS)
+#if defined(FHASH_TARGETS)
     if (b.path == FHASH_PATH_V4) return fhash_bricks_run_v4(b, part, thread);
     if (b.path == FHASH_PATH_V3) return fhash_bricks_run_v3(b, part, thread);
 #endif
@@ -57,7 +57,7 @@ class Meeting {
 FHASH_EXPORT int64_t fhash_bricks_work(const FhashBricks* task) {
     if (!has_path(task->path)) return FHASH_NO_PATH;
     if (!is_sound(*task)) return -1;
-#if defined(FHASH_THREE_PATHS)
+#if defined(FHASH_TARGETS)
     if (task->path == FHASH_PATH_V4) return fhash_bricks_work_v4(*task);
     if (task->path == FHASH_PATH_V3) return fhash_bricks_work_v3(*task);
 #endif

@@ -21,12 +21,12 @@ template <class P> struct Pairs {
     };
     typedef typename First<P::N>::All All;
     template <int... I>
-    static FHASH_INLINE void apart(F a, F b, F& first, F& second, Places<I...>) {
+    static void apart(F a, F b, F& first, F& second, Places<I...>) {
         first = __builtin_shufflevector(a, b, 2 * I...);
         second = __builtin_shufflevector(a, b, (2 * I + 1)...);
     }
     template <int... I>
-    static FHASH_INLINE void together(F first, F second, F& a, F& b, Places<I...>) {
+    static void together(F first, F second, F& a, F& b, Places<I...>) {
         a = __builtin_shufflevector(first, second, (I / 2 + I % 2 * P::N)...);
         b = __builtin_shufflevector(first, second, (I / 2 + P::N / 2 + I % 2 * P::N)...);
     }
@@ -66,7 +66,7 @@ struct Place {
 };
 
 // Write the numbers of a row of corners between two key frames, embedding by embedding.
-template <class P> FHASH_INLINE void corners_of(const Place& p, std::int64_t row, const float* flat,
+template <class P> void corners_of(const Place& p, std::int64_t row, const float* flat,
                                                 float* FHASH_RESTRICT to) {
     typedef typename P::F F;
     const float* from = flat + p.rows[row];
@@ -90,7 +90,7 @@ template <class P> FHASH_INLINE void corners_of(const Place& p, std::int64_t row
 }
 
 // to[i] = w0 * a[i] + w1 * b[i]
-template <class P> FHASH_INLINE void mix(float* to, const float* a, const float* b, float w0,
+template <class P> void mix(float* to, const float* a, const float* b, float w0,
                                          float w1, std::int64_t count) {
     const typename P::F v0 = all<P>(w0), v1 = all<P>(w1);
     for (std::int64_t i = 0; i < count; i += P::N)
@@ -98,7 +98,7 @@ template <class P> FHASH_INLINE void mix(float* to, const float* a, const float*
 }
 
 // Write the embeddings of a level at a brick's vertices, in rows `row` numbers apart.
-template <class P> FHASH_INLINE void interpolate(const Place& p, const float* flat,
+template <class P> void interpolate(const Place& p, const float* flat,
                                                  const Planes& m, float* to, std::int64_t row) {
     const FhashBricks& b = p.b;
     const std::int64_t lines = p.nz * p.ny;
@@ -138,7 +138,7 @@ template <class P> FHASH_INLINE void interpolate(const Place& p, const float* fl
 // Sum `lines` of `length` numbers, `apart` numbers apart, into corners: the transpose of `mix`
 // along one axis. first, weight: the two corners of each line. Corners come `out_apart` numbers
 // apart.
-template <class P> FHASH_INLINE void collect(float* to, std::int64_t corners,
+template <class P> void collect(float* to, std::int64_t corners,
                                              std::int64_t out_apart, const float* from,
                                              std::int64_t lines, std::int64_t apart,
                                              const std::int32_t* first, const float* weight,
@@ -170,7 +170,7 @@ template <class P> FHASH_INLINE void collect(float* to, std::int64_t corners,
 }
 
 // Add the gradients by the numbers of a row of corners, given those by its vertices, to `to`.
-template <class P> FHASH_INLINE void add_corners(const Place& p, std::int64_t row,
+template <class P> void add_corners(const Place& p, std::int64_t row,
                                                  const float* vertices, std::int64_t apart,
                                                  float* corners, float* FHASH_RESTRICT to) {
     const std::int64_t length = p.b.shape[2];
@@ -220,7 +220,7 @@ template <class P> FHASH_INLINE void add_corners(const Place& p, std::int64_t ro
 
 // Add the gradients by the numbers of a level to `to`, given those by the embeddings at a brick's
 // vertices, in rows `row` numbers apart.
-template <class P> FHASH_INLINE void add_transposed(const Place& p, const float* from,
+template <class P> void add_transposed(const Place& p, const float* from,
                                                     std::int64_t row, const Planes& m, float* to) {
     const FhashBricks& b = p.b;
     const std::int64_t lines = p.nz * p.ny;

@@ -77,6 +77,9 @@ constexpr std::int64_t FHASH_ABI = 17;
 #if (defined(__x86_64__) || defined(__i386__)) && defined(__GNUC__)
 #include <cpuid.h>
 
+#include <cstdlib>
+#include <cstring>
+
 // Instructions that kernels ask for.
 constexpr unsigned FHASH_HAS_CLMUL = 1;   // PCLMULQDQ and SSE4.1
 constexpr unsigned FHASH_HAS_CRC32 = 2;   // SSE4.2
@@ -84,7 +87,8 @@ constexpr unsigned FHASH_HAS_V3 = 4;      // x86-64-v3: AVX2, FMA, BMI and more
 constexpr unsigned FHASH_HAS_V4 = 8;      // x86-64-v4: AVX-512 F, BW, CD, DQ, VL
 constexpr unsigned FHASH_HAS_VNNI = 16;   // these, and AVX-512 VNNI
 
-// The instructions of this processor that the system lets be used. __builtin_cpu_supports says so,
+// The instructions of this processor that the system lets be used, at most those that the environment
+// variable FHASH_INSTRUCTIONS names, for tests: baseline or avx2. __builtin_cpu_supports says so,
 // too, but for the compiler of ziglang, where it has no answer.
 static inline unsigned fhash_instructions() {
     static const unsigned found = [] {
@@ -94,6 +98,8 @@ static inline unsigned fhash_instructions() {
         if (all(c, 1u << 1 | 1u << 19)) has |= FHASH_HAS_CLMUL;
         if (all(c, 1u << 20)) has |= FHASH_HAS_CRC32;
         const unsigned first = c;
+        const char* const most = std::getenv("FHASH_INSTRUCTIONS");
+        if (most && !std::strcmp(most, "baseline")) return has;
         if (!all(first, 1u << 27)) return has;  // the system does not say what it saves
         __asm__(".byte 0x0f, 0x01, 0xd0" : "=a"(saved), "=d"(d) : "c"(0));  // xgetbv
         if (!__get_cpuid_count(7, 0, &a, &wide, &extended, &d)) return has;
@@ -102,6 +108,7 @@ static inline unsigned fhash_instructions() {
         const bool v3 = all(first, 1u << 22 | 1u << 23 | 1u << 12 | 1u << 28 | 1u << 29) &&
                         all(wide, 1u << 3 | 1u << 5 | 1u << 8) && all(c, 1u << 5) && all(saved, 6);
         if (v3) has |= FHASH_HAS_V3;
+        if (most && !std::strcmp(most, "avx2")) return has;
         // F, DQ, CD, BW, VL; registers of 512 bits
         if (v3 && all(wide, 1u << 16 | 1u << 17 | 1u << 28 | 1u << 30 | 1u << 31) &&
             all(saved, 0xe6)) {

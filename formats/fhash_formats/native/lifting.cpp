@@ -5,6 +5,8 @@
 // levels in place (level l at stride 2^l), and scattered to the bands, low first. Along x a row is
 // split into its even and odd halves. Coupled y and x go level by level through one plane at a
 // time.
+#include "loops.hpp"
+
 #include "core.hpp"
 #include "lifting_tile.hpp"
 

@@ -3,6 +3,8 @@
 //
 // Scores of values are summed over the vertices within reach along z, then y, then x, and cut after
 // each axis. Each sum is that of the vertex before, plus one value, less one.
+#include "loops.hpp"
+
 #include <algorithm>
 #include <cstring>
 #include <vector>

@@ -1,4 +1,6 @@
 // Coefficients to integers and back, element by element.
+#include "loops.hpp"
+
 #include <cmath>
 #include <cstdint>
 

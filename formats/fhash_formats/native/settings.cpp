@@ -317,7 +317,7 @@ bool read_layers(Bytes& data, Head& head, float sigma, fhash_error& error) {
 
 bool read_head(Bytes& data, Settings& settings, fhash_error& error) {
     Bytes block;
-    float sigma;
+    float sigma = 0;
     if (!read_block(data, block, error)) return false;
     settings.head = std::make_unique<Head>();
     Head& head = *settings.head;

@@ -28,6 +28,7 @@
 #endif
 #elif FHASH_TARGET
 #pragma GCC push_options
+#pragma GCC optimize("O3")
 #pragma GCC diagnostic ignored "-Wuninitialized"  // by <immintrin.h> of GCC 12 itself
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
 #if FHASH_TARGET == 4

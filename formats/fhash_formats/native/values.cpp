@@ -1,4 +1,6 @@
 // Passes over the values of a tile, element by element.
+#include "loops.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

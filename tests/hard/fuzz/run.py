@@ -44,20 +44,20 @@ TARGETS = tuple(
     )
 )
 SOURCES = (
-    *("coder", "fast", "fast_v3", "trellis", "mask", "mask_levels", "predict", "labels"),
+    *("coder", "fast", "trellis", "mask", "mask_levels", "predict", "labels"),
+    *("coder_v3", "fast_v3", "trellis_v3", "mask_v3", "predict_v3", "labels_v3"),
     *("lifting", "head", "quantise", "values", "crc32c", "prior_bytes", "priors", "inflate"),
     *("settings", "coding", "plan", "differences", "tile", "choose", "encode", "chunk", "part"),
-    *("fhash", "file", "json", "zip", "zarr", "variable", "volume", "chunks", "reading"),
-    *("plain", "paper"),
+    "files",
 )
 """Files of NATIVE that are always fuzzed."""
 LIBRARIES = ("yyjson", "zlib", "zstd")
 """Folders of NATIVE / "third_party", in C, which only the address sanitizer watches."""
 CODEC_SOURCES = (*("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head"),)
 """Files of CODEC that are always fuzzed."""
-NETWORK_SOURCES = ("peak", "points")
+NETWORK_SOURCES = ("peak", "points", "kernels_v1", "kernels_v3", "kernels_v4")
 """Files of NETWORK that are always fuzzed."""
-MARCH = ("march", "march_bricks", "march_effects")
+MARCH = ("march", "march_v3", "march_v4", "march_bricks")
 """Files of CODEC that are fuzzed on request, without optimisation.
 
 The compiler takes one minute for them; with optimisation it takes ten.

@@ -12,7 +12,7 @@ namespace fhash {
 
 namespace {
 
-std::string table_name(size_t level) { return "tables/level_" + std::to_string(level); }
+std::string lattice_table(size_t level) { return "tables/level_" + std::to_string(level); }
 
 struct Widths {
     std::vector<int64_t> hidden;
@@ -179,7 +179,7 @@ void take_part(const Lattice& lattice, const Region& region, int64_t key, size_t
 // The table of a level of detail, in the type of the values.
 bool read_coarse(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                  Frame& frame, fhash_error& error) {
-    const Array& table = *variable.find(table_name(size_t(lattice.lod) + 1));
+    const Array& table = *variable.find(lattice_table(size_t(lattice.lod) + 1));
     const int64_t step = int64_t(1) << lattice.lod;
     const auto nearest = [&](int a, int64_t number) {
         const int64_t vertex = lattice.first[a] + number * step;
@@ -226,7 +226,7 @@ bool check_plain(const Variable& variable, fhash_error& error) {
     for (size_t level = 0; level < variable.levels.size(); level++) {
         std::vector<int64_t> shape(variable.levels[level].begin(), variable.levels[level].end());
         shape.push_back(1);
-        if (!check_array(variable, table_name(level + 1).c_str(), shape,
+        if (!check_array(variable, lattice_table(level + 1).c_str(), shape,
                          {narrow ? int32_t(FHASH_FLOAT32) : int32_t(FHASH_FLOAT64)}, true, error))
             return false;
     }

@@ -13,8 +13,8 @@ constexpr uint64_t MAX_CHUNK_BYTES = 1 << 30;     // of a decoded inner chunk
 constexpr uint64_t MAX_TILE = 1 << 27;            // vertices
 constexpr uint64_t MAX_SHARD_CHUNKS = 1 << 20;
 constexpr uint64_t MAX_DOCUMENT = 16 << 20;
-constexpr uint64_t GAP = 64 << 10;                // bytes between documents that are read as well
-constexpr uint64_t MOST = 16 << 20;               // bytes of a read of several documents
+constexpr uint64_t DOCUMENT_GAP = 64 << 10;   // bytes between documents that are read as well
+constexpr uint64_t DOCUMENT_READ = 16 << 20;  // bytes of a read of several documents
 const char* const TYPES[12] = {"",       "int8",   "int16",  "int32",   "int64",   "uint8",
                                "uint16", "uint32", "uint64", "float16", "float32", "float64"};
 const char* const TILE_AXES[4] = {"t", "z", "y", "x"};
@@ -434,8 +434,8 @@ struct Documents {
             total += member.full_size < 0 ? member.size : uint64_t(member.full_size);
             if (member.size > MAX_DOCUMENT) return damaged(error, "metadata of over 2^24 bytes");
             if (!may_use(*source.context, total, error)) return false;
-            if (!together.empty() && (member.offset - together.back()->end() > GAP ||
-                                      member.end() - together.front()->offset > MOST)) {
+            if (!together.empty() && (member.offset - together.back()->end() > DOCUMENT_GAP ||
+                                      member.end() - together.front()->offset > DOCUMENT_READ)) {
                 if (!read_span(together, error)) return false;
                 together.clear();
             }

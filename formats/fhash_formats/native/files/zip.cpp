@@ -14,7 +14,7 @@ namespace {
 constexpr uint64_t TAIL = 64 << 10;              // bytes that are read first
 constexpr uint64_t MAX_DIRECTORY = 1 << 28;      // bytes of the directory
 constexpr uint64_t MAX_MEMBER = uint64_t(1) << 31;
-constexpr uint64_t MAX_DOCUMENT = 16 << 20;      // bytes of an inflated member
+constexpr uint64_t MAX_INFLATED = 16 << 20;    // bytes of an inflated member
 constexpr size_t MAX_NAME = 512;
 constexpr size_t COMMENT = 79;                   // bytes of the comment of this format
 constexpr uint64_t MAX_16 = 0xFFFF, MAX_32 = 0xFFFFFFFF;
@@ -176,7 +176,7 @@ bool parse_entry(const uint8_t*& at, const uint8_t* stop, Member& member, fhash_
     member.full_size = method == 8 ? int64_t(full) : -1;
     member.offset = from_little(at + 42, 4);
     if (method == 8) {
-        if (!is_document(member.name) || member.size >= full || full > MAX_DOCUMENT)
+        if (!is_document(member.name) || member.size >= full || full > MAX_INFLATED)
             return fail(error, FHASH_ERROR_DAMAGED, "member %s may not be deflated so",
                         member.name.c_str());
     } else if (method || member.size != full || member.size > MAX_MEMBER) {

@@ -22,9 +22,9 @@ namespace fhash {
 namespace {
 
 constexpr uint64_t ABSENT = ~uint64_t(0);
-constexpr uint64_t ENTRY = 16;             // bytes of an inner chunk in the index of its shard
-constexpr uint64_t GAP = 16 << 10;         // bytes between two chunks that are read as well
-constexpr uint64_t MOST = 8 << 20;         // bytes of a read of several chunks
+constexpr uint64_t INDEX_ENTRY = 16;       // bytes of an inner chunk in the index of its shard
+constexpr uint64_t CHUNK_GAP = 16 << 10;   // bytes between two chunks that are read as well
+constexpr uint64_t CHUNK_READ = 8 << 20;   // bytes of a read of several chunks
 constexpr uint64_t SMALL_INDEX = 64 << 10; // bytes up to which all of an index is read
 constexpr uint64_t SHARE = 4;              // as is one of which that share is needed
 constexpr uint64_t INDEX = 1000;           // in the place of a level of detail, in the cache
@@ -188,9 +188,9 @@ struct Indices {
     bool check(uint64_t shard, const Buffer& entries, uint64_t data_bytes,
                fhash_error& error) const {
         uint64_t position = 0;
-        for (uint64_t number = 0; number < entries.size() / ENTRY; number++) {
-            const uint64_t offset = from_little(entries.data() + ENTRY * number, 8);
-            const uint64_t length = from_little(entries.data() + ENTRY * number + 8, 8);
+        for (uint64_t number = 0; number < entries.size() / INDEX_ENTRY; number++) {
+            const uint64_t offset = from_little(entries.data() + INDEX_ENTRY * number, 8);
+            const uint64_t length = from_little(entries.data() + INDEX_ENTRY * number + 8, 8);
             const bool there = present(shard, number);
             const bool good = there ? offset == position && length <= data_bytes - position
                                     : offset == ABSENT && length == ABSENT;
@@ -210,10 +210,10 @@ struct Indices {
         const Cache::Key key = {array.number, shard, INDEX};
         ChunkPointer found = file.cache.get(key);
         if (found && uint64_t(found->shape[0]) <= first &&
-            last < uint64_t(found->shape[0]) + found->values.size() / ENTRY)
+            last < uint64_t(found->shape[0]) + found->values.size() / INDEX_ENTRY)
             return found;
         const Member& member = file.directory.members[array.members[size_t(shard)]];
-        const uint64_t count = chunks(), index_bytes = count * ENTRY + 4;
+        const uint64_t count = chunks(), index_bytes = count * INDEX_ENTRY + 4;
         if (member.size < index_bytes) {
             fail(error, FHASH_ERROR_DAMAGED, "member %s: too few bytes for the index of a shard",
                  member.name.c_str());
@@ -223,8 +223,9 @@ struct Indices {
         const bool whole = index_bytes <= SMALL_INDEX || (last - first + 1) * SHARE >= count;
         const std::shared_ptr<Chunk> made = std::make_shared<Chunk>();
         made->shape[0] = whole ? 0 : int64_t(first);
-        const uint64_t start = member.data_offset() + data_bytes + uint64_t(made->shape[0]) * ENTRY;
-        const uint64_t length = whole ? index_bytes : (last - first + 1) * ENTRY;
+        const uint64_t start =
+            member.data_offset() + data_bytes + uint64_t(made->shape[0]) * INDEX_ENTRY;
+        const uint64_t length = whole ? index_bytes : (last - first + 1) * INDEX_ENTRY;
         Buffer& bytes = made->values;
         if (!file.source.read(start, length, bytes, error)) return nullptr;
         if (whole) {
@@ -241,9 +242,9 @@ struct Indices {
 
     bool locate(const Chunk& entries, Wanted& wanted, fhash_error& error) const {
         const uint64_t at = wanted.in_shard - uint64_t(entries.shape[0]);
-        const uint64_t offset = from_little(entries.values.data() + ENTRY * at, 8);
-        const uint64_t length = from_little(entries.values.data() + ENTRY * at + 8, 8);
-        const uint64_t data_bytes = wanted.member->size - (chunks() * ENTRY + 4);
+        const uint64_t offset = from_little(entries.values.data() + INDEX_ENTRY * at, 8);
+        const uint64_t length = from_little(entries.values.data() + INDEX_ENTRY * at + 8, 8);
+        const uint64_t data_bytes = wanted.member->size - (chunks() * INDEX_ENTRY + 4);
         if (length > data_bytes || offset > data_bytes - length)
             return fail(error, FHASH_ERROR_DAMAGED,
                         "member %s: an inner chunk is missing or reaches beyond the shard",
@@ -384,13 +385,14 @@ struct Reading {
         std::sort(wanted.begin(), wanted.end(),
                   [](const Wanted& a, const Wanted& b) { return a.offset < b.offset; });
         const uint64_t memory = file.context->memory;
-        const uint64_t most = memory ? std::min(MOST, memory / 8) : MOST;
+        const uint64_t most = memory ? std::min(CHUNK_READ, memory / 8) : CHUNK_READ;
         for (size_t first = 0, last; first < wanted.size(); first = last) {
             const uint64_t start = wanted[first].offset;
             uint64_t stop = start + wanted[first].length;
             for (last = first + 1; last < wanted.size(); last++) {
                 const uint64_t end = wanted[last].offset + wanted[last].length;
-                if (wanted[last].offset > stop + GAP || std::max(stop, end) - start > most) break;
+                if (wanted[last].offset > stop + CHUNK_GAP) break;
+                if (std::max(stop, end) - start > most) break;
                 stop = std::max(stop, end);
             }
             Buffer bytes;
