@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
 import re
 import shutil
 import subprocess
@@ -17,15 +19,18 @@ from fhash_formats.native import FOLDER, PROTOTYPES
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "docs" / "examples"
+CODEC = ROOT / "fhash_codec" / "native"
+NETWORK = CODEC / "network"
 HEADER = (FOLDER / "fhash.h").read_text(encoding="utf-8")
 LINKED = [f"-I{FOLDER}", f"-L{FOLDER}", "-lfhash", f"-Wl,-rpath,{FOLDER}"]
 
 
-def run(*words: object, folder: Path | None = None) -> str:
+def run(*words: object, folder: Path | None = None, more: dict[str, str] | None = None) -> str:
     """Output of a program; the test skips where it is not installed."""
     if shutil.which(str(words[0])) is None:
         pytest.skip(f"{words[0]} is not installed")
-    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True)
+    texts, variables = [str(word) for word in words], {**os.environ, **(more or {})}
+    done = subprocess.run(texts, cwd=folder, capture_output=True, text=True, env=variables)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -57,6 +62,71 @@ def test_build_files_agree_on_version_and_flags() -> None:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "GNU_FLAGS"
     )
     assert not [flag for flag in flags if flag.startswith(("-f", "-O")) and flag not in cmake]
+
+
+def test_no_object_is_as_large_as_it_was() -> None:
+    """The compiler takes a second for 40 kB: six of 78 units had 3.1 MB and took 81 of 154 s."""
+    sizes = json.loads((ROOT / "build" / "objects.json").read_text(encoding="utf-8"))
+    assert len(sizes) > 60
+    assert sum(sizes.values()) < 4_500_000
+    assert sizes.pop("files.o") < 600_000  # at -O1: a second for 130 kB
+    assert max(sizes.values()) < 220_000, max(sizes, key=sizes.__getitem__)
+
+
+@pytest.mark.every
+@pytest.mark.skipif(sys.platform != "linux", reason="objdump reads ELF")
+@pytest.mark.parametrize(
+    "source",
+    sorted([*FOLDER.glob("*_v3.cpp"), *CODEC.glob("*_v[34].cpp"), *NETWORK.glob("*_v[34].cpp")]),
+    ids=lambda path: path.stem,
+)
+def test_what_may_be_linked_into_others_is_for_every_processor(
+    source: Path, tmp_path: Path
+) -> None:
+    """The linker takes any copy of an inline function: none may have instructions of AVX2."""
+    made = tmp_path / "unit.o"
+    run("g++", "-std=c++17", "-fPIC", "-O2", f"-I{FOLDER}", "-c", source, "-o", made)
+    weak = {line.split()[-1] for line in run("nm", made).splitlines() if line[17] in "VWu"}
+    wide, others = 0, []
+    for function in re.split(r"\n(?=[0-9a-f]+ <)", run("objdump", "-d", "--no-show-raw-insn", made)):
+        named = re.match(r"[0-9a-f]+ <(.*)>:", function)
+        if named and re.search(r"\t(v[a-z]+|shlx|rorx) ", function):
+            wide += 1
+            if named[1] in weak or named[1].startswith("_GLOBAL__"):
+                others.append(named[1])
+    assert wide
+    assert not others
+
+
+INSTRUCTIONS = """
+import hashlib, sys
+import numpy as np
+from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
+x = np.random.default_rng(0).normal(size=(3, 9, 21, 37)).cumsum(axis=3)
+smooth = np.sin(np.linspace(0, 9, 37) * np.linspace(1, 2, 21)[:, None]) + 0.01 * x
+labels = (x[0] > 0).astype("u1") + (x[0] > 2)
+for values, options in (
+    (smooth.astype("f4"), {"max_error": 0.01}),
+    (smooth, {"max_error": 0.001, "effort": 9}),
+    (smooth.astype("f4"), {"max_error": 0.1, "effort": 1}),
+    (np.where(x > -1, x, np.nan), {"max_error": 0.05}),
+    ((100 * x).astype("i4"), {"max_error": 0}),
+    (labels, {"max_error": 0}),
+):
+    codec = NumcodecsTransform(**options)
+    coded = bytes(codec.encode(values))
+    print(hashlib.sha256(coded + codec.decode(coded).tobytes()).hexdigest())
+"""
+"""Prints a digest of the bytes and of the decoded values of arrays that all coders take part in."""
+
+
+def test_every_instruction_set_has_the_same_bits() -> None:
+    shown = {
+        run(sys.executable, "-c", INSTRUCTIONS, more={"FHASH_INSTRUCTIONS": instructions})
+        for instructions in ("baseline", "avx2", "all")
+    }
+    assert len(shown) == 1
+    assert len(set(shown.pop().split())) == 6
 
 
 @pytest.fixture(scope="module")
