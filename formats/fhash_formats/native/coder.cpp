@@ -29,6 +29,7 @@ struct Task {
     Flags* flags;
     Signs* signs;
     int32_t* q;
+    bool trellis;         // whether the integers are those of two quantisers
     const float* scaled;  // null, or what integers are chosen of
     double lambda;        // squared steps that 1/2048 bit is worth
     const int64_t* shape;
@@ -53,6 +54,8 @@ FHASH_INLINE void finish(Decoder&) {}
 template <Mode MODE, bool TRELLIS> struct Coder {
     Range<MODE> range;
     const Task& task;
+    // Decoding waits for each decision, and has no time to ask; encoding does.
+    const bool trellised = MODE == DECODE ? TRELLIS : task.trellis;
     State* const state = task.state;
     const double lambda = task.lambda;
 
@@ -156,7 +159,7 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
         band.any = any != 0;
         settled[0] = settled[1] = 0;
         if (!any) {
-            if (TRELLIS) trellis = after_zeros(trellis, (int64_t)n0 * n1 * n2 * n3);
+            if (trellised) trellis = after_zeros(trellis, (int64_t)n0 * n1 * n2 * n3);
             continue;
         }
         const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
@@ -184,7 +187,7 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
                 if (MODE != DECODE) for (int x = 0; x < n3; x++) filled |= out[x] != 0;
                 const int flag = (n3 > 24 ? 2 : 0) + (y > 1 && F[-2] ? 1 : 0) + (r == 0 ? 4 : 0);
                 if (!simple(filled, ROWS + flag)) {
-                    if (TRELLIS) trellis = after_zeros(trellis, n3);
+                    if (trellised) trellis = after_zeros(trellis, n3);
                     continue;
                 }
             }
@@ -205,7 +208,7 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
             // Whether the integer at x is, or may be read as, 0 without a choice.
             auto may_be_zero = [&](const int32_t* from, int x) FHASH_LAMBDA {
                 if (MODE == DECODE) return true;
-                if (MODE == ENCODE) return from[x] == 0;
+                if (!scaled) return from[x] == 0;
                 if (!(std::fabs(scaled[from - q + x]) < 0.5F)) return false;
                 out[x] = 0;
                 return true;
@@ -213,12 +216,12 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
 
             for (int x = 0; x < n3; x++) {
                 const uint32_t mu = (uint32_t)(expected[x] + LEFT * left + LEFT2 * left2);
-                const int one = TRELLIS ? trellis & 1 : 0;  // class of the quantiser
+                const int one = trellised ? trellis & 1 : 0;  // class of the quantiser
                 // Where all around is 0 and nothing moves any more, only the range does.
                 int begun = 0;
                 if (!mu && settled[one] && may_be_zero(out, x)) {
                     if (range.code(1, (uint32_t)settled[one])) {
-                        if (TRELLIS) trellis = TRELLIS_NEXT[trellis][0];
+                        if (trellised) trellis = TRELLIS_NEXT[trellis][0];
                         continue;
                     }
                     begun = 1;
@@ -231,7 +234,7 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
                     context[2] = small(near) * 144 + sides[x];
                 }
                 auto predict = [&](Prediction& to, int asked) FHASH_LAMBDA {
-                    const int k = TRELLIS && one && asked < SHARED ? UNARY + asked : asked;
+                    const int k = one && asked < SHARED ? UNARY + asked : asked;
                     for (int i = 0; i < CONTEXTS; i++)
                         to.slots[i] = asked ? slots[i] + (int64_t)context[i] * DECISIONS + k
                                             : flags[i] + (int64_t)context[i] * 2 + one;
@@ -246,13 +249,13 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
                 // The zero flag.
                 Prediction now;
                 int p = predict(now, 0), value = MODE == DECODE ? 0 : out[x];
-                if (TRELLIS && MODE != DECODE && value && (value & 1) != one) return NO_TRELLIS;
-                if (MODE == CHOOSE) {
+                if (trellised && MODE != DECODE && value && (value & 1) != one) return NO_TRELLIS;
+                if (MODE == ENCODE && scaled) {
                     const float s = scaled[out - q + x];
                     const int best = choose(std::fabs((double)s), p, predict);
                     out[x] = value = s < 0 ? -best : best;
                 }
-                int magnitude = TRELLIS ? (std::abs(value) + one) / 2 : std::abs(value);
+                int magnitude = trellised ? (std::abs(value) + one) / 2 : std::abs(value);
                 const int zero = begun ? 0 : range.code(magnitude == 0, p);
                 const bool stays = !mu && zero && settled_at_one<CONTEXTS>(now, SLOW_LIMIT);
                 settled[one] = stays ? p : 0;
@@ -260,7 +263,7 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
                 left2 = left;
                 left = 0;
                 if (zero) {
-                    if (TRELLIS) trellis = TRELLIS_NEXT[trellis][0];
+                    if (trellised) trellis = TRELLIS_NEXT[trellis][0];
                     continue;
                 }
 
@@ -286,10 +289,10 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
                 }
                 if (MODE == DECODE) {
                     magnitude = k;
-                    if (TRELLIS) k = (int)(min<int64_t>(2 * (int64_t)k - one, 0x7fffffff));
+                    if (trellised) k = (int)(min<int64_t>(2 * (int64_t)k - one, 0x7fffffff));
                     out[x] = (k ^ -negative) + negative;
                 }
-                if (TRELLIS) trellis = TRELLIS_NEXT[trellis][magnitude & 1];
+                if (trellised) trellis = TRELLIS_NEXT[trellis][magnitude & 1];
                 band.logs[r * L2 + LOG_PADDING + x] = signed_log(magnitude, negative != 0);
                 left = min(magnitude, MAX_MAGNITUDE);
                 M[x] = (uint16_t)left;
@@ -336,11 +339,10 @@ FHASH_FOR_TARGETS(fhash_encode,
         Signs signs(state, weights);
         Flags flags(state);
         std::vector<uint8_t> out;
-        const Task task = {&state, &flags, &signs, q,    scaled,  lambda / 2048,
-                           shape,  table,  count,  &out, nullptr, 0};
-        const int64_t code = scaled    ? run<CHOOSE, false>(task)
-                             : trellis ? run<ENCODE, true>(task)
-                                       : run<ENCODE, false>(task);
+        const bool trellised = trellis != 0;
+        const Task task = {&state, &flags, &signs, q,    trellised, scaled, lambda / 2048,
+                           shape,  table,  count,  &out, nullptr,   0};
+        const int64_t code = run<ENCODE, false>(task);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) {
@@ -367,8 +369,9 @@ FHASH_FOR_TARGETS(fhash_decode,
                                  simples, simple_count, LANES);
         Signs signs(state, const_cast<int32_t*>(weights));
         Flags flags(state);
-        const Task task = {&state, &flags, &signs, q,       nullptr, 0,
-                           shape,  table,  count,  nullptr, data,    size};
+        const bool trellised = trellis != 0;
+        const Task task = {&state, &flags, &signs, q,       trellised, nullptr, 0,
+                           shape,  table,  count,  nullptr, data,      size};
         return trellis ? run<DECODE, true>(task) : run<DECODE, false>(task);
     });
 }

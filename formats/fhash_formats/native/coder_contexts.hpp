@@ -104,7 +104,7 @@ struct Flags {
     }
 };
 
-enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
+enum Mode { ENCODE, DECODE };
 
 FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
 
