@@ -11,7 +11,7 @@
 // Contexts come from magnitudes that are already known: to the left, above, one step and one layer
 // before, and in the bands that come before. Signs are predicted by coder_signs.hpp.
 //
-// With TRELLIS the integers are those of two quantisers: the index of each is coded, and says how
+// On a trellis the integers are those of two quantisers: the index of each is coded, and says how
 // the state goes on that chooses the next quantiser (FORMAT.md, Two quantisers).
 #include <cmath>
 #include <cstdint>
@@ -51,11 +51,10 @@ FHASH_INLINE void finish(Encoder& range) { range.finish(); }
 FHASH_INLINE void finish(Decoder&) {}
 
 // One run over the bands of a tile.
-template <Mode MODE, bool TRELLIS> struct Coder {
+template <Mode MODE> struct Coder {
     Range<MODE> range;
     const Task& task;
-    // Decoding waits for each decision, and has no time to ask; encoding does.
-    const bool trellised = MODE == DECODE ? TRELLIS : task.trellis;
+    const bool trellised = task.trellis;
     State* const state = task.state;
     const double lambda = task.lambda;
 
@@ -109,7 +108,7 @@ template <Mode MODE, bool TRELLIS> struct Coder {
 
 // Code all bands. 0, or -1 for bytes that no encoder writes and for a band beyond the shape, or
 // NO_TRELLIS.
-template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
+template <Mode MODE> int64_t Coder<MODE>::run() {
     int32_t* const q = task.q;
     const float* const scaled = task.scaled;
     const int64_t* const shape = task.shape;
@@ -304,8 +303,8 @@ template <Mode MODE, bool TRELLIS> int64_t Coder<MODE, TRELLIS>::run() {
 }
 
 // One run. It works on a coder of its own, whose range can then stay in registers.
-template <Mode MODE, bool TRELLIS> int64_t run(const Task& task) {
-    Coder<MODE, TRELLIS> coder = {range_of<MODE>(task), task};
+template <Mode MODE> int64_t run(const Task& task) {
+    Coder<MODE> coder = {range_of<MODE>(task), task};
     const int64_t code = coder.run();
     finish(coder.range);
     return code;
@@ -342,7 +341,7 @@ FHASH_FOR_TARGETS(fhash_encode,
         const bool trellised = trellis != 0;
         const Task task = {&state, &flags, &signs, q,    trellised, scaled, lambda / 2048,
                            shape,  table,  count,  &out, nullptr,   0};
-        const int64_t code = run<ENCODE, false>(task);
+        const int64_t code = run<ENCODE>(task);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) {
@@ -372,6 +371,6 @@ FHASH_FOR_TARGETS(fhash_decode,
         const bool trellised = trellis != 0;
         const Task task = {&state, &flags, &signs, q,       trellised, nullptr, 0,
                            shape,  table,  count,  nullptr, data,      size};
-        return trellis ? run<DECODE, true>(task) : run<DECODE, false>(task);
+        return run<DECODE>(task);
     });
 }
