@@ -100,7 +100,7 @@ int(np.ceil(high)) + 1 + margin => int(np.ceil(high)) + margin
 unpacked-sign formats/fhash_formats/readers/cf.py
 values += self.offset => values -= self.offset
 picked-index formats/fhash_formats/readers/layout.py
-slice(self.picked[place], self.picked[place] + 1) => slice(0, 1)
+one = {place: slice(index, index + 1) for => one = {place: slice(0, 1) for
 spacing-count formats/fhash_formats/writers/common.py
 extent / (len(values) - 1) => extent / len(values)
 merge-end fhash_codec/appending/parts.py
