@@ -19,5 +19,5 @@ class PyFhash(PythonPackage):
         depends_on("py-h5py@3.12:")
         depends_on("py-h5netcdf@1.4:")
         depends_on("py-xarray@2024.10:")
-        depends_on("py-click@8.1:")
+        depends_on("py-click@8.2:")
         depends_on("py-pillow@11:")
