@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units docs notebooks hard every results device lib paraview compile-times wheels wasm view clean
+.PHONY: demo test types units docs notebooks hard every results device lib paraview compile-times lowest newest wheels wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
@@ -47,6 +47,31 @@ hard: .venv/.stamp
 # Every case of every other test, of which `make test` runs up to two of each.
 every: .venv/.stamp
 	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
+
+# Whether the versions that pyproject.toml tells are true: the lowest of each library that it names, or the newest of
+# everything, each in an environment of its own below build/; quick tests of what these libraries do. torch is left out, since
+# it takes gigabytes, and so is what draws the documentation. Tools of the tests are the newest in both: users install
+# none, and what was told of the libraries before holds them where they are. The installation is editable, since tests start
+# programs in the root, where Python would find the sources first.
+lowest: RESOLUTION := lowest-direct
+newest: RESOLUTION := highest
+ENDS_EXTRAS := formats,segy,grib,adios,mesh,video,remote,notebook,bench
+ENDS_TOOLS := pytest hypothesis jsonschema cftime nibabel mrcfile pynrrd obstore dask
+ENDS_TESTS := tests/cli tests/formats/container tests/formats/readers tests/formats/writers tests/formats/transform/test_values.py \
+	tests/codec/test_dataset.py tests/codec/test_encoding.py tests/codec/test_pictures.py tests/codec/test_plain.py \
+	tests/codec/test_volume.py tests/codec/test_xarray_backend.py tests/codec/views/test_pack.py tests/codec/rendering/test_renderer.py
+# Cases that train by torch.
+ENDS_LEFT_OUT := --deselect tests/cli/test_sources.py::test_every_command_opens_its_data_alike \
+	--deselect tests/codec/test_encoding.py::test_profiles_mix
+lowest newest:
+	rm -rf build/$@
+	$(PYTHON) -m venv build/$@
+	build/$@/bin/python -m pip install --quiet uv
+	build/$@/bin/python -m uv pip install --quiet --resolution $(RESOLUTION) -e '.[$(ENDS_EXTRAS)]' -e ./benchmarks
+	build/$@/bin/python -m uv pip freeze --exclude-editable > build/$@/told.txt
+	build/$@/bin/python -m uv pip install --quiet -c build/$@/told.txt $(ENDS_TOOLS)
+	build/$@/bin/python -m uv pip list
+	build/$@/bin/pytest $(ENDS_LEFT_OUT) $(ENDS_TESTS)
 
 # Figures of README.md and docs/ from benchmarks/results, which hold what `fhash bench ... --json` printed: quick.
 results: .venv/.stamp

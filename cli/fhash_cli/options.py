@@ -21,7 +21,7 @@ AXES = 3
 """Axes of a region: z, y and x."""
 
 
-class TextType(click.ParamType[Any]):
+class TextType(click.ParamType):  # type: ignore[type-arg]  # no parameter before click 8.4
     """Values that users write as a text.
 
     name: what stands for the value in the help. parse: gives the value of a text; its ValueError

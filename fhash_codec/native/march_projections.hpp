@@ -16,8 +16,8 @@ void Packet::keep_lost_maximum() {
 }
 
 // Add the samples of a pass to the mean: r is the sum of the values above m.low, g that of the
-// lengths, in steps. `best` is -FAR before the first value, which `where` is the sample of. A sample
-// counts where its opacity is above 0: the table has one for every value.
+// lengths, in steps. `best` is -FAR before the first value, which `where` is the sample of. A
+// sample counts where its opacity is above 0: the table has one for every value.
 void Packet::average() {
     const float least = (float)m.low;
     #pragma omp simd

@@ -14,10 +14,10 @@ class PyFhash(PythonPackage):
     depends_on("py-setuptools@77:", type="build")
     with default_args(type=("build", "run")):
         depends_on("py-numpy@2.0:")
-        depends_on("py-zarr@3.1:")
+        depends_on("py-zarr@3.1.3:")
         depends_on("py-numcodecs@0.16:")
         depends_on("py-h5py@3.12:")
         depends_on("py-h5netcdf@1.4:")
-        depends_on("py-xarray@2024.10:")
-        depends_on("py-click@8.1:")
+        depends_on("py-xarray@2025.9.1:")
+        depends_on("py-click@8.2:")
         depends_on("py-pillow@11:")

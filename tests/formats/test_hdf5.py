@@ -206,7 +206,7 @@ def test_damaged_numbers_of_a_dataset_are_an_error(tmp_path: Path) -> None:
     assert data.count(shape) == 1
     data[data.index(shape) + 4] = 1  # HDF5 would read beyond the half that is decoded
     (tmp_path / "b.h5").write_bytes(data)
-    with h5py.File(tmp_path / "b.h5") as file, pytest.raises(OSError, match="filter"):
+    with h5py.File(tmp_path / "b.h5") as file, pytest.raises(OSError, match=r"filter|damaged"):
         file["v"][...]
 
 

@@ -58,8 +58,8 @@ struct Task {
     std::int64_t inputs;
 };
 
-// The kernels of a path. `run`: values of the points, derivatives (n, 4) where `slopes` is not null,
-// and those by the inputs (inputs, n) where `by_inputs` is not. `still`: the numbers of a part at
+// The kernels of a path. `run`: values of the points, derivatives (n, 4) where `slopes` is not
+// null, and those by the inputs (inputs, n) where `by_inputs` is not. `still`: the numbers of a part at
 // one time, between its two time nodes around it.
 #define FHASH_POINT_KERNELS(NAME)                                                                \
     std::int64_t run_##NAME(const Task& task, const Points& points, std::int64_t count,          \

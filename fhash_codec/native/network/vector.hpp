@@ -1,8 +1,8 @@
 // Vectors of the network's kernels: one source for AVX-512, AVX2 with FMA, and the baseline.
 //
 // A kernel is a template on a path (`Path1`, `Path2`, `Path4`), written with the vector extensions
-// of GCC and Clang; kernels_v1.cpp, kernels_v3.cpp and kernels_v4.cpp compile all of them for a path
-// (target.hpp). Nothing of the standard library may be included after this header.
+// of GCC and Clang; kernels_v1.cpp, kernels_v3.cpp and kernels_v4.cpp compile all of them for a
+// path (target.hpp). Nothing of the standard library may be included after this header.
 // Compilers without these extensions build a library that offers no path.
 #pragma once
 

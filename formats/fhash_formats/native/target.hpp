@@ -44,8 +44,8 @@
 #endif
 #endif
 
-// FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS) { ... }: the exported function NAME, which returns an
-// int64_t and exists for each target. The one of the baseline's source asks the processor.
+// FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS) { ... }: the exported function NAME, which returns
+// an int64_t and exists for each target. The one of the baseline's source asks the processor.
 #if FHASH_TARGET
 #define FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS) std::int64_t NAME##_v3 PARAMETERS
 #elif defined(FHASH_TARGETS)

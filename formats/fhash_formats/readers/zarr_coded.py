@@ -327,11 +327,11 @@ class CodedArray:
     def _undone(self, place: Place, data: bytes) -> bytes:
         """The bytes of a chunk before the codecs that came after `fhash.transform`."""
         from zarr.buffer import default_buffer_prototype
-        from zarr.core.array_spec import ArraySpec
+        from zarr.core.array_spec import ArrayConfig, ArraySpec
         from zarr.core.sync import sync
 
         prototype, array = default_buffer_prototype(), self._array
-        dtype, config = array.metadata.dtype, array.async_array.config
+        dtype, config = array.metadata.dtype, ArrayConfig.from_dict({})
         spec = ArraySpec(self._coding.chunk, dtype, array.fill_value, config, prototype)
 
         async def undo() -> Any:

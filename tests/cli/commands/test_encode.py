@@ -225,7 +225,8 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     plan, part = tmp_path / "run.plan", tmp_path / "1.fhz"
     assert "give max_error" in refused(2, "plan", data, "-o", plan)
-    assert "No such option '--psnr'" in refused(2, "plan", data, "-o", plan, "--psnr", "40")
+    unknown = refused(2, "plan", data, "-o", plan, "--psnr", "40")  # click 8.2 has no quotes
+    assert unknown.replace("'", "").replace(":", "").startswith("No such option --psnr")
     assert not plan.exists()
     assert fhash("plan", data, "-o", plan, *BOUNDED).exit_code == 0
     assert "exists; use --force" in refused(2, "plan", data, "-o", plan, *BOUNDED)
