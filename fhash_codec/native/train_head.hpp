@@ -171,8 +171,7 @@ FHASH_CLONES_512 EXACT_SUMS void gather(const double* slopes, int64_t stride, in
 // sums[o] += sum over the voxels of a block of slopes[o], each in eight lanes; `each` blocks follow
 // one another for each o.
 FHASH_CLONES_512 void gather_biases(const double* FHASH_RESTRICT slopes, int64_t each,
-                                    int64_t outputs,
-                                double* FHASH_RESTRICT sums) {
+                                    int64_t outputs, double* FHASH_RESTRICT sums) {
     for (int64_t o = 0; o < outputs; ++o)
         for (int64_t v = 0; v < each * BLOCK; v += LANES)
             for (int64_t i = 0; i < LANES; ++i)
