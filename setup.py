@@ -192,7 +192,7 @@ class BuildNative(build_ext):
 
 
 class CompileTimes(BuildNative):
-    """`compile_times`: the CPU seconds of each unit, one after the other, in a folder of its own."""
+    """`compile_times`: the CPU seconds of each unit, one after the other."""
 
     description = "print the CPU seconds of each source"
 

@@ -58,8 +58,8 @@ constexpr std::int64_t FHASH_ABI = 17;
 #endif
 
 // FHASH_CLONES before a function: compiled for AVX2 and the baseline; one is chosen when the
-// library is loaded. It works on plain functions only, neither templates nor inlines: put the body into a
-// FHASH_INLINE template and call that from a small cloned function per type. It is for loops that
+// library is loaded. It works on plain functions only, neither templates nor inlines: put the body
+// into a FHASH_INLINE template and call that from a small cloned function per type. It is for loops that
 // the compiler vectorises; target.hpp is for large sources. Elsewhere it is empty: ARM (where NEON
 // is the baseline), musl, macOS, Windows, older compilers, and Clang, whose clones leave out a
 // constructor that they inline, so that the library cannot be loaded.
@@ -88,8 +88,8 @@ constexpr unsigned FHASH_HAS_V4 = 8;      // x86-64-v4: AVX-512 F, BW, CD, DQ, V
 constexpr unsigned FHASH_HAS_VNNI = 16;   // these, and AVX-512 VNNI
 
 // The instructions of this processor that the system lets be used, at most those that the
-// environment variable FHASH_INSTRUCTIONS names, for tests: baseline or avx2. __builtin_cpu_supports says so,
-// too, but for the compiler of ziglang, where it has no answer.
+// environment variable FHASH_INSTRUCTIONS names, for tests: baseline or avx2.
+// __builtin_cpu_supports says so, too, but for the compiler of ziglang, where it has no answer.
 static inline unsigned fhash_instructions() {
     static const unsigned found = [] {
         unsigned a, b, c, d, wide = 0, extended = 0, saved = 0, has = 0;

@@ -88,7 +88,8 @@ def test_what_may_be_linked_into_others_is_for_every_processor(
     run("g++", "-std=c++17", "-fPIC", "-O2", f"-I{FOLDER}", "-c", source, "-o", made)
     weak = {line.split()[-1] for line in run("nm", made).splitlines() if line[17] in "VWu"}
     wide, others = 0, []
-    for function in re.split(r"\n(?=[0-9a-f]+ <)", run("objdump", "-d", "--no-show-raw-insn", made)):
+    listed = run("objdump", "-d", "--no-show-raw-insn", made)
+    for function in re.split(r"\n(?=[0-9a-f]+ <)", listed):
         named = re.match(r"[0-9a-f]+ <(.*)>:", function)
         if named and re.search(r"\t(v[a-z]+|shlx|rorx) ", function):
             wide += 1
