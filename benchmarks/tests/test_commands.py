@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from command_line import Fhash, Refused
 
-from fhash_bench import engines as clock
-from fhash_bench import train as bench
 from fhash_bench.commands.rate import PEER, Peer, filters_of, opened, programs_of
 from fhash_bench.main import command
 from fhash_bench.pictures import vtk
@@ -314,15 +312,20 @@ def test_unsuitable_options_are_refused(
 WORDS = ("bench", "train", "--seconds", "0.1", "--width", "4", "--hidden-layers", "1", "-q")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def steady(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clocks that advance by 10 ms whenever they are read."""
+    from fhash_bench import engines as clock
+    from fhash_bench import train as bench
+
     ticks = count()
     read = lambda: next(ticks) / 100  # noqa: E731
     monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=read, process_time=read))
     monkeypatch.setattr(bench, "INFER_SECONDS", 0.03)
 
 
+@pytest.mark.torch
+@pytest.mark.usefixtures("steady")
 def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
     result = fhash(*WORDS, data, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -333,6 +336,8 @@ def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
     assert {"cores", "device"} <= set(report["machine"])
 
 
+@pytest.mark.torch
+@pytest.mark.usefixtures("steady")
 def test_it_prints_a_row_for_each_engine_and_draws_curves(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -355,6 +360,8 @@ def test_it_prints_a_row_for_each_engine_and_draws_curves(
     assert "--force" in again.stderr
 
 
+@pytest.mark.torch
+@pytest.mark.usefixtures("steady")
 def test_a_series_is_made_where_none_is_given(
     fhash: Fhash, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,12 +12,14 @@ import pytest
 from command_line import Fhash
 from json_schemas import check, example, parsed
 
-from fhash_bench import engines, train
 from fhash_bench.pictures.results import RenderBench
 from fhash_bench.rate.measuring import RateBench
 
 
+@pytest.mark.torch
 def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fhash_bench import engines, train
+
     ticks = count()
     read = lambda: next(ticks) / 100  # noqa: E731
     monkeypatch.setattr(engines, "time", SimpleNamespace(perf_counter=read, process_time=read))

@@ -49,9 +49,13 @@ sys.exit(code)
 All cases of the goldens, and some random tiles, which are encoded, too.
 """
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != "linux" or not shutil.which("g++"), reason="every other library is Clang's"
-)
+pytestmark = [
+    pytest.mark.clang,
+    pytest.mark.skipif(
+        sys.platform != "linux" or not shutil.which("g++"),
+        reason="every other library is Clang's",
+    ),
+]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pretended_cuda import pretended_cuda
 
 import fhash_codec
 from fhash_codec.boxes import Box
@@ -326,8 +325,11 @@ CONFIG_FIT_ON_CUDA = EncodeConfig(
 )
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize("tables", ["float16", "transform"])
 def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
+    from pretended_cuda import pretended_cuda
+
     values = np.add.outer(np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9)))
     config = replace(CONFIG_FIT_ON_CUDA, epochs=3, batch=0, tables=tables)
     with pretended_cuda() as pretended, warnings.catch_warnings():

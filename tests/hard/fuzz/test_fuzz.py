@@ -44,6 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
+@pytest.mark.hard
 def test_the_native_code_under_sanitizers(folder: Path) -> None:
     try:
         figures = run.fuzz(
@@ -64,6 +65,7 @@ def test_the_native_code_under_sanitizers(folder: Path) -> None:
     assert figures.edges > 3000
 
 
+@pytest.mark.hard
 def test_every_target_has_a_name_and_seeds(folder: Path) -> None:
     if not (folder / "corpus").exists():
         run.prepare(folder, EVERY)

@@ -15,7 +15,6 @@ from frame_field import CENTRAL, NETWORK_SCENES, SCENES, FrameField
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume, native
-from fhash_codec.paper.engines.fused import engine as start
 from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.rendering.bricks import Palette
 from fhash_codec.rendering.grid import Grid
@@ -522,6 +521,7 @@ def test_on_the_host_a_sample_has_the_same_bits_in_any_pass(network: Network) ->
         np.testing.assert_array_equal(inference.slopes(places[chosen]), slopes[chosen])
 
 
+@pytest.mark.torch
 def test_fused_kernels_are_taken_where_they_can_be_had(
     network: Network, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -531,7 +531,7 @@ def test_fused_kernels_are_taken_where_they_can_be_had(
         asked.append(given)
         return fused if len(asked) == 1 else None
 
-    monkeypatch.setattr(start, "start_points", started)
+    monkeypatch.setattr("fhash_codec.paper.engines.fused.engine.start_points", started)
     assert inference_in(tensors, network, 0.6) is fused
     assert isinstance(inference_in(tensors, network, 0.6), HostInference)
     assert isinstance(inference_in(NUMPY, network, 0.6), HostInference)

@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
 from frame_field import NETWORK_SCENES, SCENES, FrameField
 from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
