@@ -66,24 +66,18 @@ def test_headless_docstrings_are_recognised(text: str, headless: bool) -> None:
     assert bool(HEADLESS.match(text)) is headless
 
 
-def test_docstrings_begin_with_their_subject() -> None:
-    found = [
-        f"{relative(path)}:{text.lineno}: {text.value.strip().splitlines()[0]}"
-        for path in SOURCES
-        for text in docstrings(ast.parse(path.read_text(encoding="utf-8")))
-        if HEADLESS.match(text.value)
-    ]
-    assert not found, "\n".join(found)
-
-
-def test_constants_are_defined_one_at_a_time() -> None:
-    found = [
-        f"{relative(path)}:{statement.lineno}"
-        for path in SOURCES
-        if "tests" not in path.parts
-        for statement in constants_together(ast.parse(path.read_text(encoding="utf-8")))
-    ]
-    assert not found, "\n".join(found)
+def test_docstrings_begin_with_their_subject_and_constants_are_defined_one_at_a_time() -> None:
+    headless, together = [], []
+    for path in SOURCES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for text in docstrings(tree):
+            if HEADLESS.match(text.value):
+                first = text.value.strip().splitlines()[0]
+                headless.append(f"{relative(path)}:{text.lineno}: {first}")
+        if "tests" not in path.parts:
+            together += [f"{relative(path)}:{each.lineno}" for each in constants_together(tree)]
+    assert not headless, "\n".join(headless)
+    assert not together, "\n".join(together)
 
 
 def test_native_sources_fit_into_the_columns() -> None:

@@ -445,7 +445,7 @@ def test_where_no_step_fits_the_best_table_below_is_taken() -> None:
     [
         ({"effort": 2}, {"price", "best", "tried", "region_ms"}),
         ({"effort": 2, "timings": False}, {"price", "best", "tried"}),
-        ({"effort": 1}, {"price", "best", "tried"}),
+        ({"effort": 1}, {"price", "best", "tried", "coder"}),
         ({"effort": 2, "tile": "4x8x12x8"}, {"region_ms"}),
         ({"effort": 1, "access": "fast", "timings": False}, {"price", "best", "tried", "coder"}),
         ({"effort": 2, "tile": "whole", "timings": False}, set()),

@@ -34,7 +34,7 @@ OF_A_PICTURE = 8
 """Waits of a picture besides those of its passes: the rays at the start, counters, and results."""
 WAITS = 8
 """Waits that a pass may take."""
-WAITS_WITH_SURFACES = 14
+WAITS_WITH_SURFACES = 15
 """Waits that a pass may take with surfaces, whose search ends when all of a pass are found."""
 FRAMES = ("plain", "surfaces", "maximum", "graded", "all light")
 NETWORKS = ("plain", "between", "central", "graded", "surfaces", "attenuated", "unskipped")
