@@ -34,10 +34,11 @@ units: .venv/.stamp
 torch vtk clang: %: .venv/.%
 	$(BIN)/python -m pytest $(QUICK) -m '$@ and not every'
 
-# The documentation site: build/docs/index.html. Needs no network; a warning is an error.
-docs: .venv/.docs
+# The documentation site: build/docs/index.html. Needs no network; a warning is an error. All that its pages show runs.
+docs: .venv/.docs .venv/.vtk
 	rm -rf build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+	$(BIN)/python -m pytest $(SPREAD) -m docs
 
 # The notebooks of the documentation with their outputs.
 notebooks: .venv/.docs

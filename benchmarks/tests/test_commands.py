@@ -205,6 +205,7 @@ def test_a_generated_series_has_no_options() -> None:
 QUICK = ["--size", "16", "--turns", "1", "-q"]
 
 
+@pytest.mark.vtk
 def test_prints_tables(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vtk, "FINE_SIZE", 16)
     monkeypatch.setattr(vtk, "EXPLAINED_SIZE", 16)
@@ -275,6 +276,7 @@ def data_bench_ablate(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.torch
 def test_a_table_has_a_row_for_each_variation(
     fhash: Fhash, data_bench_ablate: Path, tmp_path: Path
 ) -> None:
@@ -296,6 +298,7 @@ def test_a_table_has_a_row_for_each_variation(
     ]
 
 
+@pytest.mark.torch
 def test_unsuitable_options_are_refused(
     refused: Refused, data_bench_ablate: Path, tmp_path: Path
 ) -> None:
@@ -414,6 +417,7 @@ def test_parameters_are_printed_to_the_unit(fhash: Fhash, tmp_path: Path) -> Non
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.torch
 def test_cells_of_own_data_are_resumed(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     words = ["bench", "paper", data, *FEW, "--protocol", "equal", "-o", tmp_path / "cells"]
     words += ["--encoding", "hash", "--encoding", "tcnn"]
@@ -429,6 +433,7 @@ def test_cells_of_own_data_are_resumed(fhash: Fhash, data: Path, tmp_path: Path)
     assert path.stat().st_mtime_ns == before
 
 
+@pytest.mark.torch
 def test_files_are_asked_for_by_data_set(
     fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -449,6 +454,7 @@ def test_files_are_asked_for_by_data_set(
     assert "SZ3 not measured" in result.stdout
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize(
     ("words", "line"),
     [

@@ -103,7 +103,7 @@ def test_every_command_opens_its_data_alike(
 ) -> None:
     data = inputs / name
     assert message in refused(2, "diff", data, run, *words)
-    assert message in refused(2, "bench", "train", data, "--seconds", "0.1", "-q", *words)
+    assert message in refused(2, "bench", "rate", data, "--target", "40", "-q", *words)
 
 
 SETTINGS = [

@@ -99,7 +99,6 @@ def test_arrays_in_memory_and_datasets_of_xarray(tmp_path: Path) -> None:
 
 
 def test_profiles_mix(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
     path, arrays = tmp_path / "run.fhz", {"a": values(0), "b": values(1)}
     paper = EncodeConfig(profile="paper", epochs=2, width=4, timings=False)
     fhash_codec.encode_dataset(arrays, path, {"a": paper, "b": QUICK})

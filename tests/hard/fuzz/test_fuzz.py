@@ -128,6 +128,7 @@ def test_every_file_that_is_called_is_built() -> None:
     assert set(declarations.exported(others)) <= NOT_FUZZED.keys()
 
 
+@pytest.mark.hard
 def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fuzzer that sees nothing would pass all other tests."""
     source = (run.NATIVE / "quantise.cpp").read_text(encoding="utf-8")
@@ -156,6 +157,7 @@ def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     )
 
 
+@pytest.mark.hard
 def test_code_that_does_not_compile_is_no_reason_to_skip(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

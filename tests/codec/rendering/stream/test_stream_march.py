@@ -302,6 +302,7 @@ def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> No
     assert alike == here.counters
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_torch_makes_the_picture_of_numpy(
@@ -320,6 +321,7 @@ def test_torch_makes_the_picture_of_numpy(
             np.testing.assert_allclose(other, mine, atol=1e-5)
 
 
+@pytest.mark.torch
 def test_nothing_leaves_the_device_before_the_picture(
     planned: Planned, volume: Volume, tensors: Arrays
 ) -> None:
@@ -360,6 +362,7 @@ def test_nothing_leaves_the_device_before_the_picture(
     assert sorted(taken) == [rays, 3 * rays, 4 * rays]
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
 def test_torch_marches_through_a_network_as_numpy_does(
     planned: Planned, files: dict[str, Path], tensors: Arrays, scene: dict[str, Any]
@@ -378,6 +381,7 @@ def test_torch_marches_through_a_network_as_numpy_does(
         np.testing.assert_allclose(there.normal, here.normal, atol=1e-3)
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize("kind", ["compact", "paper"])
 def test_cuda_makes_the_picture_of_numpy(
     files: dict[str, Path], planned: Planned, kind: str
@@ -397,6 +401,7 @@ def test_cuda_makes_the_picture_of_numpy(
     assert there.counters["rays"] == here.counters["rays"]
 
 
+@pytest.mark.torch
 def test_a_device_without_enough_memory_says_so(
     planned: Planned, volume: Volume, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -442,6 +447,7 @@ def test_central_differences_reach_one_vertex_to_both_sides(frame_task: FrameTas
     np.testing.assert_allclose(found[0, 1:], [-2, 5.25], rtol=1e-6)
 
 
+@pytest.mark.torch
 def test_a_field_that_does_not_fit_says_so(
     files: dict[str, Path],
     volume: Volume,
@@ -595,8 +601,8 @@ def test_cells_and_bricks_hide_nothing() -> None:
     assert np.all((low[known] <= values[known] + 1e-6) & (values[known] <= high[known] + 1e-6))
 
 
+@pytest.mark.torch
 def test_tensors_give_the_same(tensors: Arrays) -> None:
-    pytest.importorskip("torch")
     places = np.random.default_rng(3).uniform(0, 6, (50, 3))
     _, numpy_field, _ = fields()
     _, torch_field, _ = fields(tensors)
