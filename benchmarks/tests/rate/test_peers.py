@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rarely import rarely
 
 from fhash_bench.rate.peers import (
     ENCODERS,
@@ -146,8 +147,8 @@ def test_temporary_files_go_away(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", QOZ_NAMES)
-@pytest.mark.parametrize("shape", [(4, 6, 20, 24), (1, 6, 20, 24), (3, 1, 1, 9)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(3, 1, 1, 9), *rarely((4, 6, 20, 24), (1, 6, 20, 24))])
+@pytest.mark.parametrize("dtype", [np.float32, *rarely(np.float64)])
 def test_the_level_is_a_tolerance(
     qoz: str,
     field: Callable[..., np.ndarray],
@@ -197,6 +198,7 @@ def test_every_name_has_variants(tthresh: str, qoz: str, ffmpeg: str) -> None:
         programs({"zip": qoz})
 
 
+@pytest.mark.every
 def test_programs_are_measured_like_other_peers(
     tthresh: str, qoz: str, ffmpeg: str, field: Callable[..., np.ndarray]
 ) -> None:
@@ -244,8 +246,8 @@ def test_a_failing_program_is_said_in_one_line(
     }
 
 
-@pytest.mark.parametrize("shape", [(4, 6, 20, 24), (1, 6, 20, 24), (3, 1, 1, 9)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16])
+@pytest.mark.parametrize("shape", [(3, 1, 1, 9), *rarely((4, 6, 20, 24), (1, 6, 20, 24))])
+@pytest.mark.parametrize("dtype", [np.float32, *rarely(np.float64, np.int16)])
 def test_the_psnr_is_that_of_the_level(
     tthresh: str,
     field: Callable[..., np.ndarray],
@@ -284,7 +286,7 @@ def psnr(values: np.ndarray, decoded: np.ndarray) -> float:
     return float(20 * np.log10(np.ptp(values) / np.sqrt(np.mean((decoded - values) ** 2.0))))
 
 
-@pytest.mark.parametrize("shape", [(4, 6, 20, 24), (1, 3, 65, 72), (2, 1, 1, 9)])
+@pytest.mark.parametrize("shape", [(2, 1, 1, 9), *rarely((4, 6, 20, 24), (1, 3, 65, 72))])
 def test_a_finer_level_is_better(
     ffmpeg: str, field: Field, tmp_path: Path, shape: tuple[int, ...]
 ) -> None:
