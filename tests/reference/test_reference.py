@@ -33,7 +33,7 @@ from reference.tile import chunk_of, decode_tile
 GOLDEN = Path(__file__).parents[1] / "golden"
 MOST_VERTICES = 1 << 17 if LONG else 4000
 """Most vertices of a tile that is compared."""
-MOST_TILES = 1000 if LONG else 2
+MOST_TILES = 1000 if LONG else 1
 """Most tiles of an array that are compared."""
 
 
@@ -96,7 +96,7 @@ def test_differences(dtype: str, shape: tuple[int, int, int, int]) -> None:
 def test_windows_of_hard_cases(quality: dict[str, float]) -> None:
     """A window from the middle of each series of the catalogue, as a chunk."""
     compared = 0
-    for case in cases() if LONG else cases()[::2]:
+    for case in cases() if LONG else cases()[::8]:
         frames = np.stack(list(islice(case.make().frames(), 3)))
         middle = tuple(
             slice((n - m) // 2, None) for n, m in zip(frames.shape, (3, 5, 6, 9), strict=True)
@@ -106,7 +106,7 @@ def test_windows_of_hard_cases(quality: dict[str, float]) -> None:
         theirs = decode_tile_mask(data, window.shape, window.dtype)
         assert equal(decode_tile(data, window.shape, window.dtype), theirs), case.name
         compared += 1
-    assert compared > 60
+    assert compared > 15
 
 
 @pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
