@@ -39,7 +39,6 @@ from fhash_codec.rendering.stream_fields import (
     NetworkField,
     WarpedField,
     central_slopes,
-    inference_in,
     shares,
 )
 from fhash_codec.rendering.stream_march import Canvas, Events, stream
@@ -525,23 +524,6 @@ def test_on_the_host_a_sample_has_the_same_bits_in_any_pass(network: Network) ->
         chosen = random.permutation(len(places))[:count]
         np.testing.assert_array_equal(inference.values(places[chosen]), values[chosen])
         np.testing.assert_array_equal(inference.slopes(places[chosen]), slopes[chosen])
-
-
-@pytest.mark.torch
-def test_fused_kernels_are_taken_where_they_can_be_had(
-    network: Network, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, fused = [], object()
-
-    def started(*given: object) -> object:
-        asked.append(given)
-        return fused if len(asked) == 1 else None
-
-    monkeypatch.setattr("fhash_codec.paper.engines.fused.engine.start_points", started)
-    assert inference_in(tensors, network, 0.6) is fused
-    assert isinstance(inference_in(tensors, network, 0.6), HostInference)
-    assert isinstance(inference_in(NUMPY, network, 0.6), HostInference)
-    assert asked == 2 * [(network, 0.6, tensors.device)]
 
 
 X = np.array([0, 1, 2, 4, 8, 16, 17, 18, 19, 20.0])
