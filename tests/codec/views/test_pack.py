@@ -389,7 +389,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [*list(CASES)[-2:], *rarely(*list(CASES)[:-2])])
 def test_a_store_shows_what_the_container_shows(tmp_path: Path, case: str) -> None:
     make, settings = CASES[case]
     check_unpack(encoded(tmp_path, make(), **settings))
