@@ -34,8 +34,9 @@ units: .venv/.stamp
 torch vtk clang: %: .venv/.%
 	$(BIN)/python -m pytest $(QUICK) -m '$@ and not every'
 
-# The documentation site: build/docs/index.html. Needs no network; a warning is an error. All that its pages show runs.
-docs: .venv/.docs .venv/.vtk
+# The documentation site: build/docs/index.html. Needs no network; a warning is an error. All that its pages show runs; its
+# reference imports modules that need torch.
+docs: .venv/.docs .venv/.torch .venv/.vtk
 	rm -rf build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 	$(BIN)/python -m pytest $(SPREAD) -m docs
