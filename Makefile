@@ -6,47 +6,59 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # Tests run in a process for each processor; those of a file stay together, since they share what is dear to make.
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
+# What pytest does to show the values of a failed assert takes each process longer than the rest of collecting: a file that
+# fails shows them where it runs alone.
+QUICK := $(SPREAD) --assert=plain
+# Programs that tests start would else compile all that they import.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types units docs notebooks hard every results device lib paraview compile-times lowest newest wheels wasm view clean
+.PHONY: demo test types units torch vtk clang docs notebooks hard every results device lib paraview compile-times lowest newest wheels \
+	wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
 	$(BIN)/fhash demo -o demo --force
 
-# Types are checked beside the tests: mypy takes a minute of one processor.
+# All that needs none of the heavy tools below. Types are checked beside the tests.
 test: .venv/.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j 2 types docs units
+	$(MAKE) --no-print-directory -j 2 types units
 
 types: .venv/.stamp
 	$(BIN)/mypy
 
 units: .venv/.stamp
-	$(BIN)/python -m pytest $(SPREAD)
+	$(BIN)/python -m pytest $(QUICK)
 
-# The documentation site: build/docs/index.html. Needs no network; a warning is an error.
-docs: .venv/.stamp
+# Tests that need one heavy tool, which is installed here and not by `make test`: torch; VTK; Clang as the package ziglang.
+torch vtk clang: %: .venv/.%
+	$(BIN)/python -m pytest $(QUICK) -m '$@ and not every'
+
+# The documentation site: build/docs/index.html. Needs no network; a warning is an error. All that its pages show runs; its
+# reference imports modules that need torch.
+docs: .venv/.docs .venv/.torch .venv/.vtk
 	rm -rf build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+	$(BIN)/python -m pytest $(SPREAD) -m docs
 
 # The notebooks of the documentation with their outputs.
-notebooks: .venv/.stamp
+notebooks: .venv/.docs
 	cd docs/notebooks && $(CURDIR)/$(BIN)/jupyter execute --inplace *.ipynb && rm -f *.nc *.fhz
 
 # Hard cases, hostile files, faults, fuzzing and `fhash selftest --all`: an hour on 2 processors; needs g++. docs/stability.md
 # gets the figures.
-hard: .venv/.stamp
+hard: .venv/.torch .venv/.clang
 	mkdir -p build/hard
 	rm -f build/hard/figures.jsonl
-	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD) tests/fresh tests/golden tests/hard
+	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD) -m "" tests/fresh tests/golden tests/hard
 	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
 	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
 	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md
 
-# Every case of every other test, of which `make test` runs up to two of each.
-every: .venv/.stamp
-	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
+# Every case of every other test, whatever its mark.
+every: .venv/.torch .venv/.vtk
+	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) -m "" --ignore tests/fresh --ignore tests/golden --ignore tests/hard
 
 # Whether the versions that pyproject.toml tells are true: the lowest of each library that it names, or the newest of
 # everything, each in an environment of its own below build/; quick tests of what these libraries do. torch is left out, since
@@ -60,9 +72,6 @@ ENDS_TOOLS := pytest hypothesis jsonschema cftime nibabel mrcfile pynrrd obstore
 ENDS_TESTS := tests/cli tests/formats/container tests/formats/readers tests/formats/writers tests/formats/transform/test_values.py \
 	tests/codec/test_dataset.py tests/codec/test_encoding.py tests/codec/test_pictures.py tests/codec/test_plain.py \
 	tests/codec/test_volume.py tests/codec/test_xarray_backend.py tests/codec/views/test_pack.py tests/codec/rendering/test_renderer.py
-# Cases that train by torch.
-ENDS_LEFT_OUT := --deselect tests/cli/test_sources.py::test_every_command_opens_its_data_alike \
-	--deselect tests/codec/test_encoding.py::test_profiles_mix
 lowest newest:
 	rm -rf build/$@
 	$(PYTHON) -m venv build/$@
@@ -71,7 +80,7 @@ lowest newest:
 	build/$@/bin/python -m uv pip freeze --exclude-editable > build/$@/told.txt
 	build/$@/bin/python -m uv pip install --quiet -c build/$@/told.txt $(ENDS_TOOLS)
 	build/$@/bin/python -m uv pip list
-	build/$@/bin/pytest $(ENDS_LEFT_OUT) $(ENDS_TESTS)
+	build/$@/bin/pytest $(ENDS_TESTS)
 
 # Figures of README.md and docs/ from benchmarks/results, which hold what `fhash bench ... --json` printed: quick.
 results: .venv/.stamp
@@ -84,8 +93,8 @@ lib:
 	cmake --install build/cmake
 
 # What pvpython shows of a container, and its picture in build/paraview. Needs paraview, python3-paraview and xvfb.
-paraview: .venv/.stamp
-	FHASH_PARAVIEW=$(CURDIR)/build/paraview $(BIN)/python -m pytest -rs tests/codec/views/test_vtk.py
+paraview: .venv/.vtk
+	FHASH_PARAVIEW=$(CURDIR)/build/paraview $(BIN)/python -m pytest -rs -m "" tests/codec/views/test_vtk.py
 
 # Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/howto/gpu.md): 7 minutes.
 device:
@@ -97,7 +106,7 @@ device:
 PLATFORMS := x86_64-linux-gnu.2.17/manylinux_2_17_x86_64 aarch64-linux-gnu.2.17/manylinux_2_17_aarch64 \
 	x86_64-linux-musl/musllinux_1_2_x86_64 aarch64-linux-musl/musllinux_1_2_aarch64 x86_64-macos.11.0/macosx_11_0_x86_64 \
 	aarch64-macos.11.0/macosx_11_0_arm64 x86_64-windows-gnu/win_amd64 aarch64-windows-gnu/win_arm64
-wheels: .venv/.stamp $(PLATFORMS:%=wheel/%)
+wheels: .venv/.clang $(PLATFORMS:%=wheel/%)
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	$(BIN)/python -m build --no-isolation --wheel --outdir dist benchmarks
 	ls -l dist
@@ -115,16 +124,22 @@ wasm: .venv/.stamp
 view: .venv/.stamp
 	FHASH_VIEW=build/view $(BIN)/python -m pytest tests/codec/views/test_page.py
 
-wheel/%: .venv/.stamp
+wheel/%: .venv/.clang
 	FHASH_TARGET=$(*D) $(BIN)/python setup.py -q build --build-base build/$(*F) bdist_wheel --plat-name $(*F) -d dist
 
-# torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
-# the choice is made before any other requirement counts. Python compiles what it imports; pip would compile all of torch,
-# and vtk, which takes minutes.
+# Python compiles what it imports; pip would compile all, which takes minutes.
 .venv/.stamp: pyproject.toml benchmarks/pyproject.toml constraints.txt | .venv/bin/python
-	$(INSTALL) torch
 	$(INSTALL) -e '.[dev]' -e ./benchmarks
 	touch $@ .venv/.plain
+
+# Heavy tools, each by what brings it in beside what is there.
+PACKAGES_torch := 'fhash[cuda]'
+PACKAGES_vtk := 'fhash-bench[vtk]'
+PACKAGES_docs := 'fhash[docs]'
+PACKAGES_clang := ziglang build
+.venv/.%: constraints.txt | .venv/.stamp
+	$(INSTALL) $(PACKAGES_$*)
+	touch $@
 
 .venv/.plain: pyproject.toml constraints.txt | .venv/bin/python
 	$(INSTALL) -e .

@@ -26,15 +26,9 @@ HEADLESS = re.compile(
     r"\s*(Of|In|By|That|What|As|With|From|Where|When|How|Which|No|More|For|At|On|To|Than)\b"
 )
 """Words that a docstring must not begin with: its subject would be missing, or stand elsewhere."""
+OPENED = re.compile(r'^ *"""(\s*.+)', re.MULTILINE)
+"""The first line of a docstring: of a module, a class or a function, or below a constant."""
 MAX_COLUMNS = 100
-
-
-def docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
-    """Every string that stands alone: of modules, classes and functions, and below constants."""
-    for node in ast.walk(tree):
-        constant = node.value if isinstance(node, ast.Expr) else None
-        if isinstance(constant, ast.Constant) and isinstance(constant.value, str):
-            yield constant
 
 
 def constants_together(tree: ast.Module) -> Iterator[ast.Assign]:
@@ -68,10 +62,10 @@ def test_headless_docstrings_are_recognised(text: str, headless: bool) -> None:
 
 def test_docstrings_begin_with_their_subject() -> None:
     found = [
-        f"{relative(path)}:{text.lineno}: {text.value.strip().splitlines()[0]}"
+        f"{relative(path)}: {text.strip()}"
         for path in SOURCES
-        for text in docstrings(ast.parse(path.read_text(encoding="utf-8")))
-        if HEADLESS.match(text.value)
+        for text in OPENED.findall(path.read_text(encoding="utf-8"))
+        if HEADLESS.match(text)
     ]
     assert not found, "\n".join(found)
 

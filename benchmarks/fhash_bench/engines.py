@@ -182,7 +182,7 @@ class Peaks:
 
 def _device_seconds(work: Any) -> float:
     """Seconds of some work on the current CUDA device."""
-    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     begin.record()
     work()
     end.record()

@@ -1,7 +1,4 @@
-"""Clocks that advance whenever they are read, and the command line with a tiny series.
-
-`make test` runs these tests by the policy of tests/conftest.py, so that only the quick ones run.
-"""
+"""Clocks that advance whenever they are read, and the command line with a tiny series."""
 
 from __future__ import annotations
 
@@ -14,8 +11,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from fhash_bench import engines, train
-
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # pytest's importlib mode puts no folder of tests on the path.
 HERE = Path(__file__).resolve().parent
@@ -23,12 +18,14 @@ TESTS = HERE.parents[1] / "tests"
 PATHS = (TESTS / "helpers", TESTS / "codec", HERE / "paper", HERE / "pictures")
 sys.path[:0] = map(str, PATHS)
 
-from command_line import data, fhash, refused, run  # noqa: E402, F401
+from command_line import data, fhash, refused, run  # noqa: F401
 
 
 @pytest.fixture
 def ticking(monkeypatch: pytest.MonkeyPatch) -> Callable[[Iterator[float]], None]:
     """A function that makes both clocks read times from an iterator."""
+
+    from fhash_bench import engines
 
     def tick(times: Iterator[float]) -> None:
         read = lambda: next(times)  # noqa: E731
@@ -40,6 +37,8 @@ def ticking(monkeypatch: pytest.MonkeyPatch) -> Callable[[Iterator[float]], None
 @pytest.fixture
 def quick(ticking: Callable[[Iterator[float]], None], monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that advances by a millisecond whenever it is read, and little work."""
+    from fhash_bench import engines, train
+
     ticking(tick / 1000 for tick in count())
     monkeypatch.setattr(train, "INFER_SECONDS", 0.003)
     monkeypatch.setattr(engines, "FMA_ROUNDS", 100)

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from command_line import Fhash, Refused
 
-from fhash_bench import engines as clock
-from fhash_bench import train as bench
 from fhash_bench.commands.rate import PEER, Peer, filters_of, opened, programs_of
 from fhash_bench.main import command
 from fhash_bench.pictures import vtk
@@ -207,6 +205,7 @@ def test_a_generated_series_has_no_options() -> None:
 QUICK = ["--size", "16", "--turns", "1", "-q"]
 
 
+@pytest.mark.vtk
 def test_prints_tables(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vtk, "FINE_SIZE", 16)
     monkeypatch.setattr(vtk, "EXPLAINED_SIZE", 16)
@@ -277,6 +276,7 @@ def data_bench_ablate(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.torch
 def test_a_table_has_a_row_for_each_variation(
     fhash: Fhash, data_bench_ablate: Path, tmp_path: Path
 ) -> None:
@@ -298,6 +298,7 @@ def test_a_table_has_a_row_for_each_variation(
     ]
 
 
+@pytest.mark.torch
 def test_unsuitable_options_are_refused(
     refused: Refused, data_bench_ablate: Path, tmp_path: Path
 ) -> None:
@@ -314,15 +315,20 @@ def test_unsuitable_options_are_refused(
 WORDS = ("bench", "train", "--seconds", "0.1", "--width", "4", "--hidden-layers", "1", "-q")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def steady(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clocks that advance by 10 ms whenever they are read."""
+    from fhash_bench import engines as clock
+    from fhash_bench import train as bench
+
     ticks = count()
     read = lambda: next(ticks) / 100  # noqa: E731
     monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=read, process_time=read))
     monkeypatch.setattr(bench, "INFER_SECONDS", 0.03)
 
 
+@pytest.mark.torch
+@pytest.mark.usefixtures("steady")
 def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
     result = fhash(*WORDS, data, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -333,6 +339,8 @@ def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
     assert {"cores", "device"} <= set(report["machine"])
 
 
+@pytest.mark.torch
+@pytest.mark.usefixtures("steady")
 def test_it_prints_a_row_for_each_engine_and_draws_curves(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -355,6 +363,8 @@ def test_it_prints_a_row_for_each_engine_and_draws_curves(
     assert "--force" in again.stderr
 
 
+@pytest.mark.torch
+@pytest.mark.usefixtures("steady")
 def test_a_series_is_made_where_none_is_given(
     fhash: Fhash, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -407,6 +417,7 @@ def test_parameters_are_printed_to_the_unit(fhash: Fhash, tmp_path: Path) -> Non
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.torch
 def test_cells_of_own_data_are_resumed(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     words = ["bench", "paper", data, *FEW, "--protocol", "equal", "-o", tmp_path / "cells"]
     words += ["--encoding", "hash", "--encoding", "tcnn"]
@@ -422,6 +433,7 @@ def test_cells_of_own_data_are_resumed(fhash: Fhash, data: Path, tmp_path: Path)
     assert path.stat().st_mtime_ns == before
 
 
+@pytest.mark.torch
 def test_files_are_asked_for_by_data_set(
     fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -442,6 +454,7 @@ def test_files_are_asked_for_by_data_set(
     assert "SZ3 not measured" in result.stdout
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize(
     ("words", "line"),
     [

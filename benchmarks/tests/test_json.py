@@ -12,12 +12,14 @@ import pytest
 from command_line import Fhash
 from json_schemas import check, example, parsed
 
-from fhash_bench import engines, train
 from fhash_bench.pictures.results import RenderBench
 from fhash_bench.rate.measuring import RateBench
 
 
+@pytest.mark.torch
 def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fhash_bench import engines, train
+
     ticks = count()
     read = lambda: next(ticks) / 100  # noqa: E731
     monkeypatch.setattr(engines, "time", SimpleNamespace(perf_counter=read, process_time=read))
@@ -38,6 +40,7 @@ def test_bench_table(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     check("bench table", parsed(fhash(*words, "-o", tmp_path, "--json", "-q")))
 
 
+@pytest.mark.torch
 def test_bench_ablate(fhash: Fhash, data: Path) -> None:
     words = ["bench", "ablate", data, "--axis", "samples", "--epochs", "1"]
     check("bench ablate", parsed(fhash(*words, "--json", "-q")))
@@ -48,6 +51,7 @@ def test_bench_labels(fhash: Fhash) -> None:
     check("bench labels", parsed(fhash(*words, "--json", "-q")))
 
 
+@pytest.mark.torch
 def test_bench_paper(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     words = ["bench", "paper", data, "--quick", "--epochs", "1", "--protocol", "equal", "--feature"]
     words += ["interval:6:99", "--encoding", "fhash", "-o", tmp_path, "--no-latency"]

@@ -40,6 +40,7 @@ def test_regions_of_a_kind_are_connected_and_basins_cover_all() -> None:
     assert (basins[:, :, :, 1:] == basins[:, :, :, :-1]).mean() > 0.7
 
 
+@pytest.mark.every
 def test_sizes_of_made_series_come_with_the_worst_first() -> None:
     told: list[tuple[int, int]] = []
 

@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
 
 from fhash_bench import train
 from fhash_bench.engines import (

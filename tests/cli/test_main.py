@@ -146,7 +146,7 @@ SIGNALS = ("SIGTERM", "SIGHUP", "SIGINT")
 """Signals that ask the program to stop."""
 
 SLOW_DISK = """
-import os, signal, sys, time
+import sys
 from fhash_cli import main
 if sys.argv[1] == "decode":
     from fhash_codec.volume import Volume as Slow
@@ -156,7 +156,7 @@ else:
     name = "add_array"  # of a paper file, and of a compact one of a single tile
 def sleeping(*_, **__):
     print("ready", file=sys.stderr, flush=True)
-    time.sleep(10)  # frames are read in a thread, which is waited for
+    sys.stdin.read()  # frames are read in a thread, which is waited for
 setattr(Slow, name, sleeping)
 main.main()
 """
@@ -185,12 +185,17 @@ def test_a_signal_leaves_nothing_half_written(
         "decode": ["decode", run, "-o", tmp_path / "out.npy"],
     }[command]
     with subprocess.Popen(
-        [sys.executable, "-c", SLOW_DISK, *words], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", SLOW_DISK, *words],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
+        assert process.stdin is not None
         assert process.stderr is not None
         lines = iter(process.stderr)
         assert "ready\n" in lines
         process.send_signal(getattr(signal, name))
+        process.stdin.close()
         rest = "".join(lines)
     assert process.returncode == 130
     assert len(rest.splitlines()) == 1

@@ -103,8 +103,6 @@ def test_plain_coordinates_cost_at_most_300_bytes(tmp_path) -> None:
 
 @pytest.mark.parametrize("config", [QUICK, PAPER], ids=["compact", "paper"])
 def test_both_profiles_and_plain_files_keep_everything(tmp_path, config) -> None:
-    if config.profile == "paper":
-        pytest.importorskip("torch")
     kind = KINDS["rotated"]()
     # too many numbers for the header
     long = np.arange(400.0)

@@ -10,6 +10,8 @@ import sys
 from importlib.metadata import distributions
 from pathlib import Path
 
+import pytest
+
 import fhash_codec
 
 SCRIPT = Path(__file__).parent / "run.py"
@@ -19,6 +21,7 @@ HANGS = """    yield {"done": 1}
     yield from measured_points("""
 
 
+@pytest.mark.torch
 def test_the_parts_run_without_zarr(tmp_path) -> None:
     words = [str(SCRIPT), str(tmp_path), "--device", "cpu", "--quick"]
     done = subprocess.run(

@@ -131,6 +131,7 @@ def test_every_block_has_a_language_that_says_whether_it_runs() -> None:
     assert sum(row[2] in RUN for row in found) > 4 * sum(row[2] == ELSEWHERE for row in found)
 
 
+@pytest.mark.docs
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_what_a_page_shows_runs(page: Path, folder: Path) -> None:
     names: dict[str, object] = {"__name__": "__main__"}
@@ -158,6 +159,7 @@ def check_options(text: str, place: str) -> None:
         assert shown.exit_code == 0, f"{place}: {line}: {shown.output}"
 
 
+@pytest.mark.docs
 def test_examples_of_the_help_run(folder: Path) -> None:
     epilogs = {
         name: (command.epilog or "").splitlines()
@@ -175,6 +177,7 @@ def code_of(notebook: Path) -> Iterator[str]:
             yield "".join(cell["source"])
 
 
+@pytest.mark.docs
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=named)
 def test_a_notebook_runs(notebook: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLBACKEND", "agg")

@@ -24,9 +24,8 @@ HEAVY = ("torch", "vtkmodules", "matplotlib", "hdf5plugin", "skimage", "dask")
 
 
 def test_a_plain_install_holds_no_heavy_package(site: Path, tmp_path: Path) -> None:
-    for name in HEAVY:
-        script = f"import importlib.util; print(importlib.util.find_spec({name!r}))"
-        assert run(site, tmp_path, "-c", script).stdout.strip() == "None", name
+    script = f"from importlib.util import find_spec; print([x for x in {HEAVY} if find_spec(x)])"
+    assert run(site, tmp_path, "-c", script).stdout.strip() == "[]"
 
 
 def test_the_libraries_of_the_wheel_are_loaded(site: Path, tmp_path: Path) -> None:
@@ -110,7 +109,7 @@ def test_a_plain_install_encodes_decodes_renders_and_verifies(site: Path, tmp_pa
     fhash(site, tmp_path, "verify", "run.fhz")
     fhash(site, tmp_path, "info", "run.fhz")
     fhash(site, tmp_path, "diff", "run.h5", "run.fhz", "--max-error", "0.01")
-    for suffix in (".npy", ".nc", ".h5", ".zarr", ".vti", ".vtkhdf"):
+    for suffix in (".npy", ".nc", ".zarr"):
         fhash(site, tmp_path, "decode", "run.fhz", "--t", "0", "-o", f"part{suffix}")
     decoded = np.load(tmp_path / "part.npy")
     assert np.abs(decoded - values[:1]).max() <= 0.01
@@ -118,15 +117,6 @@ def test_a_plain_install_encodes_decodes_renders_and_verifies(site: Path, tmp_pa
     fhash(site, tmp_path, "encode", "part.zarr", "-o", "zarr.fhz", "--max-error", "0.01")
     fhash(site, tmp_path, "render", "run.fhz", "-o", "picture.png", "--size", "64x64")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("profile", ["compact", "paper"])
-def test_no_encode_needs_torch(site: Path, tmp_path: Path, profile: str) -> None:
-    z, y, x = np.meshgrid(*[np.linspace(-1, 1, n) for n in (20, 24, 28)], indexing="ij")
-    frames = [np.tanh(6 * (x - 0.1 * t) * y + 3 * z) for t in range(6)]
-    np.save(tmp_path / "run.npy", np.array(frames, np.float32))
-    fhash(site, tmp_path, "encode", "run.npy", "-o", "run.fhz", "--profile", profile)
-    assert '"psnr"' in fhash(site, tmp_path, "info", "run.fhz", "--json")
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,8 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_formats.series import AXES, Series, index_coordinate
 
+pytestmark = pytest.mark.hard
+
 EACH_ALONE = ("render pictures",)
 """Commands with several outputs, each of which is complete or absent by itself."""
 

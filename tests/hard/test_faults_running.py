@@ -18,6 +18,8 @@ from folders import listing
 from reporting import LONG, record
 from sources import FORMS
 
+pytestmark = pytest.mark.hard
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 EACH_ALONE = ("render pictures",)
 """Commands with several outputs, each of which is complete or absent by itself."""

@@ -22,9 +22,12 @@ from reporting import LONG, record
 MANY = 12_000
 """Mutations; kinds and goldens take turns."""
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != "linux", reason="limits on memory and time are those of Linux"
-)
+pytestmark = [
+    pytest.mark.hard,
+    pytest.mark.skipif(
+        sys.platform != "linux", reason="limits on memory and time are those of Linux"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

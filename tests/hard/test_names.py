@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mutations
+import pytest
 from fuzz import run
 from test_faults_running import PLACES
 
@@ -76,11 +77,13 @@ def test_sources_of_the_fuzzer_exist() -> None:
         assert path.is_file(), path
 
 
+@pytest.mark.hard
 def test_seeds_of_the_fuzzer_are_written_of_every_golden(tmp_path: Path) -> None:
     run.prepare(tmp_path, every=40)
     assert any((tmp_path / "corpus").iterdir())
 
 
+@pytest.mark.hard
 def test_mutations_of_goldens_are_made() -> None:
     """A golden that a mutation cannot take would stop the long set after a quarter of an hour."""
     for number in range(0, 12_000, 10):

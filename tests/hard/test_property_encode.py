@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import xarray
 import zarr
 from hypothesis import example, given
@@ -24,6 +25,8 @@ import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning
 from fhash_formats.container import Container
 from fhash_formats.errors import FhashError, QualityError
+
+pytestmark = pytest.mark.hard
 
 DTYPES = (*FLOATS, *INTEGERS, "int64", "uint64")  # those of 64 bits twice: floats have not all
 Shape = tuple[int, int, int, int]

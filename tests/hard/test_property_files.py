@@ -41,6 +41,8 @@ from fhash_formats.series import (
 )
 from fhash_formats.support.values import json_attributes, plain_json
 
+pytestmark = pytest.mark.hard
+
 SHAPE = (4, 3, 5, 6)
 TABLE = {"name": "fhash.transform"}
 

@@ -26,6 +26,8 @@ from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.scenes import Scene, Shading
 from fhash_formats.errors import FhashError, InputError, RegionError
 
+pytestmark = pytest.mark.hard
+
 COLOURS = st.sampled_from(["#000000", "#ff8000", "white", "red", "transparent", "no colour"])
 TEXTS = {
     "colours": st.sampled_from(["viridis", "gray", "coolwarm", "no map"]),

@@ -47,6 +47,8 @@ from fhash_formats.transform.tile import (
 )
 from fhash_formats.transform.tile_format import TileSettings
 
+pytestmark = pytest.mark.hard
+
 
 @st.composite
 def specs(draw: Draw, shape: tuple[int, ...]) -> TransformSpec:

@@ -24,6 +24,8 @@ from fhash_formats.series import AXES, Coordinate
 from fhash_formats.writers.common import Region
 from fhash_formats.writers.registry import save_region
 
+pytestmark = pytest.mark.hard
+
 ORDERS = st.permutations(AXES)
 
 

@@ -20,7 +20,7 @@ from click.testing import Result
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path.append(str(DOCS))
 
-from schemas import RESULTS, keys, schema_of  # noqa: E402
+from schemas import RESULTS, keys, schema_of
 
 Draft = jsonschema.Draft202012Validator
 WHOLE = Draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from properties import NUMBERS, Draw, arrays, looking
+from rarely import rarely
 from reporting import LONG
 from specs import MIXES, spec_of
 from tiles import predictor_of, random_head
@@ -32,7 +33,7 @@ from reference.tile import chunk_of, decode_tile
 GOLDEN = Path(__file__).parents[1] / "golden"
 MOST_VERTICES = 1 << 17 if LONG else 4000
 """Most vertices of a tile that is compared."""
-MOST_TILES = 1000 if LONG else 2
+MOST_TILES = 1000 if LONG else 1
 """Most tiles of an array that are compared."""
 
 
@@ -91,11 +92,11 @@ def test_differences(dtype: str, shape: tuple[int, int, int, int]) -> None:
             assert theirs[0].tobytes() == values.tobytes()
 
 
-@pytest.mark.parametrize("quality", [{"max_error_rel": 1e-3}, {"max_error": 0.0}])
+@pytest.mark.parametrize("quality", [{"max_error_rel": 1e-3}, *rarely({"max_error": 0.0})])
 def test_windows_of_hard_cases(quality: dict[str, float]) -> None:
     """A window from the middle of each series of the catalogue, as a chunk."""
     compared = 0
-    for case in cases() if LONG else cases()[::2]:
+    for case in cases() if LONG else cases()[::8]:
         frames = np.stack(list(islice(case.make().frames(), 3)))
         middle = tuple(
             slice((n - m) // 2, None) for n, m in zip(frames.shape, (3, 5, 6, 9), strict=True)
@@ -105,7 +106,7 @@ def test_windows_of_hard_cases(quality: dict[str, float]) -> None:
         theirs = decode_tile_mask(data, window.shape, window.dtype)
         assert equal(decode_tile(data, window.shape, window.dtype), theirs), case.name
         compared += 1
-    assert compared > 60
+    assert compared > 15
 
 
 @pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
@@ -196,7 +197,7 @@ def tiles(draw: Draw) -> tuple[Any, TileSettings, Coding, Any]:
     return values, settings, coding, mask
 
 
-@looking(50, 1500)
+@looking(30, 1500)
 @given(tiles())
 def test_tiles(drawn: tuple[Any, TileSettings, Coding, Any]) -> None:
     values, settings, coding, mask = drawn
@@ -223,7 +224,7 @@ def test_chunks_of_any_numbers(values: Any, quality: dict[str, float]) -> None:
     assert equal(decode_tile(data, values.shape, values.dtype), theirs)
 
 
-@pytest.mark.parametrize("scale", [1e2, 1e4, 1e6])
+@pytest.mark.parametrize("scale", [1e4, *rarely(1e2, 1e6)])
 def test_predicted_integers_of_any_size(scale: float) -> None:
     """Predictions are summed in 32 bits where values are small: here they grow from row to row."""
     shape = (3, 4, 5, 29)

@@ -434,7 +434,7 @@ class GatherModel:
     def _encoded(self, buckets: Tensor, weights: Tensor) -> Tensor:
         """Inputs of the network (n, levels E): the embeddings of all levels, concatenated."""
         corners = buckets.shape[-1]
-        encoded: Tensor = WeightedSum.apply(  # type: ignore[no-untyped-call]
+        encoded: Tensor = WeightedSum.apply(
             self.table, buckets.reshape(-1, corners), weights.reshape(-1, corners)
         )
         return encoded.view(len(buckets), -1)

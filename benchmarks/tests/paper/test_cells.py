@@ -12,6 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
 from made_cells import cell as cell_groups
 
 from fhash_bench.kept import load

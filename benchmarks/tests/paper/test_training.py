@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
 from readable_paper import interpolate
 
 from fhash_bench.paper import encodings as engines

@@ -117,6 +117,7 @@ def test_json_values_have_the_ratios(empty: RenderBench) -> None:
     }
 
 
+@pytest.mark.vtk
 def test_vtk_draws_the_shell_unlit_and_lit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shell_module, "SIDE", 24)
     found = beside_shell(1, 24)
@@ -300,6 +301,7 @@ def test_sides_are_spread_over_a_turn() -> None:
     assert [turned(scene, turn, 4).camera.azimuth for turn in range(4)] == [30, 120, 210, 300]
 
 
+@pytest.mark.vtk
 def test_a_comparison_is_of_the_whole_domain(tmp_path: Path) -> None:
     path = tmp_path / "part.fhz"
     series = ArraySeries(field(), name="density", units="", coords=axes())
@@ -312,6 +314,7 @@ def test_a_comparison_is_of_the_whole_domain(tmp_path: Path) -> None:
     assert np.isfinite(found.values).all()
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("camera", CAMERAS, ids=["turned", "parallel", "near"])
 @pytest.mark.parametrize("shaded", [False, True], ids=["unlit", "lit"])
 def test_vtk_by_its_own_rules_is_the_reference(camera: Camera, shaded: bool) -> None:
@@ -322,6 +325,7 @@ def test_vtk_by_its_own_rules_is_the_reference(camera: Camera, shaded: bool) -> 
     assert psnr is None or psnr > 50
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("camera", CAMERAS, ids=["turned", "parallel", "near"])
 def test_the_same_picture_as_vtk_unlit(camera: Camera) -> None:
     values, asked = field()[1], task(camera, shaded=False, step=0.05)
@@ -330,12 +334,14 @@ def test_the_same_picture_as_vtk_unlit(camera: Camera) -> None:
     assert psnr is None or psnr > 50
 
 
+@pytest.mark.vtk
 def test_the_ray_caster_of_vtk_gets_the_same_scene() -> None:
     values, asked = field()[1], task(CAMERAS[0], shaded=False, step=0.5)
     psnr = picture_psnr(black(vtk_picture(values, asked)), drawn(asked, values, "cpu"), 255.0)
     assert psnr is None or psnr > 35
 
 
+@pytest.mark.vtk
 def test_vtk_takes_up_another_frame_and_an_empty_window_is_black() -> None:
     asked = task(CAMERAS[0], shaded=False, step=0.5)
     first, last = field()[0], field()[3]
@@ -400,6 +406,7 @@ def test_variants_run_in_turns() -> None:
     assert all(milliseconds > 0 for milliseconds, _ in found.values())
 
 
+@pytest.mark.vtk
 def test_every_part_has_its_figures(result: RenderBench) -> None:
     report = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert report["refused"] == dict.fromkeys(

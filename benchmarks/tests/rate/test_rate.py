@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rarely import rarely
 
 import fhash_codec
 from fhash_bench.kept import load, save
@@ -48,7 +49,7 @@ from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import ArraySeries
 
 
-@pytest.mark.parametrize("kind", GENERATED)
+@pytest.mark.parametrize("kind", ["thin", *rarely(*(kind for kind in GENERATED if kind != "thin"))])
 def test_a_series_is_the_same_for_a_seed(kind: str) -> None:
     series, again = generated(PREFIX + kind), generated(PREFIX + kind)
     other = generated(PREFIX + kind, seed=1)
@@ -63,6 +64,7 @@ def test_a_series_is_the_same_for_a_seed(kind: str) -> None:
     assert times.size == series.shape[0]
 
 
+@pytest.mark.every
 def test_kinds_are_what_they_say() -> None:
     plateau = generated("generated:plateau")
     assert plateau.shape == (21, 80, 80, 80)
@@ -359,6 +361,7 @@ def source(values: np.ndarray):
     return opened
 
 
+@pytest.mark.every
 def test_cells_are_measured_once(field: Field, tmp_path: Path) -> None:
     sources = {"wave": source(field()), "other": source(field((2, 3, 9, 9)))}
     coders = own_coders((1, 2), (), {})

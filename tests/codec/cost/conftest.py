@@ -31,7 +31,7 @@ def series() -> ArraySeries:
     return ArraySeries(values, name="wave", units="K")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def report() -> CostReport:
     """A report with measured and predicted encodings, reads, pictures, and what was left out."""
     point = Encoded(

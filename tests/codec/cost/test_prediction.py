@@ -104,19 +104,16 @@ PROBE = PaperProbe(
 def test_each_step_and_each_point_of_the_curve_is_counted(
     epochs: int, points: int, steps: int
 ) -> None:
-    pytest.importorskip("torch")
     config = EncodeConfig(profile="paper", epochs=epochs)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * steps + 0.25 * points
 
 
 def test_a_batch_of_another_size_makes_other_steps() -> None:
-    pytest.importorskip("torch")
     config = EncodeConfig(profile="paper", epochs=10, batch=10_000)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * 100 + 0.25 * 10
 
 
 def test_a_share_of_a_series_has_its_samples_and_steps_of_their_size() -> None:
-    pytest.importorskip("torch")
     half = PROBE.of_share(0.5)
     assert (half.samples, half.bricks, half.bytes) == (50_000, 500, 500)
     assert half.stages["scan"] == 0.5
@@ -674,7 +671,6 @@ def test_an_encoding_that_overruns_is_no_point(series: ArraySeries, tmp_path: Pa
 
 
 def test_the_default_and_the_network_need_no_time_left(series: ArraySeries, tmp_path: Path) -> None:
-    pytest.importorskip("torch")
     allowance = Allowance(1e-9)
     encodings = OwnEncodings(series, tmp_path, allowance, foretold, silent)
     for wish in (*wishes(), *wishes()):

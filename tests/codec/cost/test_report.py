@@ -206,11 +206,12 @@ class Reader(HTMLParser):
             self.titles.append(data)
 
 
-@pytest.fixture
-def read(report: CostReport, monkeypatch: pytest.MonkeyPatch) -> Reader:
-    monkeypatch.setattr(files, "svg", svg)
+@pytest.fixture(scope="module")
+def read(report: CostReport) -> Reader:
     reader = Reader()
-    reader.feed(page(report))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "svg", svg)
+        reader.feed(page(report))
     reader.close()
     return reader
 

@@ -360,12 +360,12 @@ def other_coreset() -> Coreset:
 
 @pytest.fixture(scope="session")
 def setup() -> Callable[..., Any]:
-    """A function of a coreset and settings: the plan and a slab engine."""
+    """A function of a coreset and settings: the plan and an engine."""
 
-    def make(coreset: Coreset, epochs: int = 4, **settings: Any) -> Any:
+    def make(coreset: Coreset, epochs: int = 4, engine: str = "auto", **settings: Any) -> Any:
         usual = {"learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5}
         plan = plan_training(coreset, epochs=epochs, **usual | settings)
         architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
-        return plan, make_engine("slab", architecture, coreset, plan.rates, seed=5, device="cpu")
+        return plan, make_engine(engine, architecture, coreset, plan.rates, seed=5, device="cpu")
 
     return make

@@ -15,8 +15,6 @@ from unittest.mock import Mock
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
-from readable_paper import FHash
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, InterruptedEncodingError, OutputError
@@ -26,7 +24,6 @@ from fhash_codec.native.network import best_path
 from fhash_codec.paper import model as points
 from fhash_codec.paper import network as ranked
 from fhash_codec.paper.encode import select, sparse_tables
-from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.model import (
     PaperModel,
     PointSampler,
@@ -77,9 +74,13 @@ def test_there_are_no_levels_of_detail(model) -> None:
         model[0].read_lod(0, 1, Box.of_shape((1, 1, 1)))
 
 
+@pytest.mark.torch
 def test_values_and_gradients_are_those_of_the_papers_model_by_autograd(
     networks, network_model
 ) -> None:
+    import torch
+    from readable_paper import FHash
+
     sizes = (network_model.key_frames, *network_model.box_size)
     architecture = Architecture(
         levels=network_model.levels,
@@ -308,8 +309,10 @@ def decoded(path) -> np.ndarray:
         return volume[...]
 
 
+@pytest.mark.torch
 def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None:
     import torch
+    from readable_paper import FHash
 
     source = field()
     fhash_codec.encode(
@@ -421,7 +424,10 @@ def test_going_on_after_a_restart_gives_the_same_bytes(field, tmp_path) -> None:
     assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
 
 
+@pytest.mark.torch
 def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypatch) -> None:
+    from fhash_codec.paper.engines.slab import SlabEngine
+
     class Spoilt(SlabEngine):
         def parameters(self):
             parameters = super().parameters()
@@ -480,10 +486,14 @@ def test_values_between_key_frames_are_right_where_one_of_them_has_no_coreset(tm
     assert trained["psnr_linear"] == untrained["psnr_linear"]
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize(
     "settings", [{}, {"hidden_layers": 0, "embedding_size": 1}, {"hidden_layers": 3}]
 )
 def test_parameters_are_those_of_the_model(settings) -> None:
+    import torch
+    from readable_paper import FHash
+
     architecture = Architecture.for_box((5, 9, 17), 4, width=16, **settings)
     size = architecture.embedding_size
     tables = [torch.zeros(t * z * y * x, size) for t, z, y, x in architecture.levels]

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pretended_cuda import pretended_cuda
 
 import fhash_codec
 from fhash_codec.boxes import Box
@@ -196,7 +195,7 @@ def test_epochs_that_suit_the_data(setup, coreset, batch, epochs) -> None:
 
 def test_training_that_diverges_is_an_error(setup, coreset) -> None:
     plan, engine = setup(coreset)
-    engine.flat.fill_(float("nan"))
+    engine.flat[:] = float("nan")
     with pytest.raises(TrainingError, match="diverged"):
         train(engine, plan, coreset, TrainingProgress())
 
@@ -205,7 +204,7 @@ def test_training_that_diverges_is_an_error(setup, coreset) -> None:
 def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hidden_layers) -> None:
     plan = plan_training(coreset, epochs=4, learning_rate=1.0, schedule="constant", batch=0, seed=5)
     architecture = Architecture.for_box(coreset.box.shape, 3, width=64, hidden_layers=hidden_layers)
-    engine = make_engine("slab", architecture, coreset, plan.rates, seed=5, device="cpu")
+    engine = make_engine("auto", architecture, coreset, plan.rates, seed=5, device="cpu")
     reached = TrainingProgress()
     with pytest.raises(Diverged, match="training diverged in epoch 1: the error reached"):
         train(engine, plan, coreset, reached)
@@ -213,9 +212,10 @@ def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hid
     assert engine.step < plan.batches
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize(("rate", "says"), [(0.02, "mean"), (0.01, "mean"), (0.02, "zero")])
 def test_a_network_that_died_of_its_rate_is_no_result(setup, coreset, rate, says) -> None:
-    plan, engine = setup(coreset, learning_rate=rate)
+    plan, engine = setup(coreset, engine="slab", learning_rate=rate)
     engine.rates = np.zeros_like(plan.rates)  # it learns nothing
     engine.layers[-1].zero_()
     engine.layers[-1][0, -1] = float(coreset.values.mean()) if says == "mean" else 0.0
@@ -326,8 +326,11 @@ CONFIG_FIT_ON_CUDA = EncodeConfig(
 )
 
 
+@pytest.mark.torch
 @pytest.mark.parametrize("tables", ["float16", "transform"])
 def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
+    from pretended_cuda import pretended_cuda
+
     values = np.add.outer(np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9)))
     config = replace(CONFIG_FIT_ON_CUDA, epochs=3, batch=0, tables=tables)
     with pretended_cuda() as pretended, warnings.catch_warnings():

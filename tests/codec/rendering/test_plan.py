@@ -342,6 +342,7 @@ def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: in
         assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
 
 
+@pytest.mark.torch
 def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
@@ -395,6 +396,7 @@ def results(arrays: Arrays) -> dict[str, Array]:
     return {name: arrays.host(array) for name, array in found.items()}
 
 
+@pytest.mark.torch
 def test_operations_equal_those_of_numpy(tensors: Arrays) -> None:
     expected, result = results(NUMPY), results(tensors)
     for name, array in expected.items():
@@ -402,6 +404,7 @@ def test_operations_equal_those_of_numpy(tensors: Arrays) -> None:
         np.testing.assert_array_equal(result[name], array, err_msg=name)
 
 
+@pytest.mark.torch
 def test_a_device_without_memory_is_an_input_error(tensors: Arrays) -> None:
     import torch
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from forked import ended_well, forked, needs_fork
 from PIL import Image as Pictures
+from rarely import rarely
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
@@ -445,7 +446,7 @@ def test_nothing_is_drawn_unless_asked_for() -> None:
     assert surrounded(image, Effects(box=True), colours=named_map("grey"), quantity="") is image
 
 
-@pytest.mark.parametrize("background", ["#ffffff", "#10121c", "transparent"])
+@pytest.mark.parametrize("background", ["#ffffff", *rarely("#10121c", "transparent")])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_effect_is_seen_on_any_background(

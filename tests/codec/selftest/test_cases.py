@@ -432,6 +432,7 @@ def test_a_training_that_does_not_tell_its_restarts_is_seen(
     assert broken(untold, diverged) == {"divergence not found"}
 
 
+@pytest.mark.torch
 def test_an_engine_that_trains_another_network_is_seen(
     paper_run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 import zarr
 from coded_stores import CHUNKS, SHAPE, dataset, shown, smooth, without_provenance, write
+from rarely import rarely
 from zarr.codecs import Crc32cCodec, TransposeCodec
 
 import fhash_codec
@@ -36,12 +37,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*Zarr format 3 specification")
 @pytest.mark.parametrize(
     ("most", "shard"),
     [
-        (1 << 30, (6, 6, 12, 12)),
+        pytest.param(1 << 30, (6, 6, 12, 12), marks=pytest.mark.every),
         (2 * 18 * 384, (4, 6, 12, 12)),
-        (18 * 384, (2, 6, 12, 12)),
+        pytest.param(18 * 384, (2, 6, 12, 12), marks=pytest.mark.every),
         (9 * 384, (2, 3, 12, 12)),
-        (4 * 384, (2, 3, 4, 12)),
-        (1, (2, 3, 4, 4)),
+        pytest.param(4 * 384, (2, 3, 4, 12), marks=pytest.mark.every),
+        pytest.param(1, (2, 3, 4, 4), marks=pytest.mark.every),
     ],
 )
 def test_shards_are_of_a_bounded_size_and_keep_steps_in_order(
@@ -125,10 +126,12 @@ def check(store: Path, *names: str, **options: Any) -> fhash_codec.Volume | None
     "encoding",
     [
         {},
-        {"compressors": None},
-        {"compressors": [Crc32cCodec()]},
         {"chunks": (2, 3, 4, 4), "shards": (4, 6, 8, 8), "compressors": None},
-        {"filters": [TransposeCodec(order=(3, 1, 0, 2))]},
+        *rarely(
+            {"compressors": None},
+            {"compressors": [Crc32cCodec()]},
+            {"filters": [TransposeCodec(order=(3, 1, 0, 2))]},
+        ),
     ],
     ids=str,
 )
@@ -137,7 +140,7 @@ def test_a_store_of_dask_becomes_a_container(tmp_path: Path, encoding: dict[str,
     check(write(tmp_path, dataset(), dask=chunks, **encoding))
 
 
-@pytest.mark.parametrize("dtype", ["f8", "f2", "i1", "u2", "i4", "i8", "u8"])
+@pytest.mark.parametrize("dtype", ["f2", "i8", *rarely("f8", "i1", "u2", "i4", "u8")])
 def test_all_number_types_are_taken(tmp_path: Path, dtype: str) -> None:
     check(write(tmp_path, dataset(dtype=dtype), max_error=1 if dtype[0] != "f" else 0.1))
 
@@ -386,7 +389,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [*list(CASES)[-2:], *rarely(*list(CASES)[:-2])])
 def test_a_store_shows_what_the_container_shows(tmp_path: Path, case: str) -> None:
     make, settings = CASES[case]
     check_unpack(encoded(tmp_path, make(), **settings))

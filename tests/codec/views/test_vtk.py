@@ -124,6 +124,7 @@ print("RESULT", sha256(values.tobytes()).hexdigest())
 """
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("program", ["vtk", "paraview"])
 def test_vtk_reads_hdf5_through_the_filter(program: str, tmp_path: Path) -> None:
     values = np.random.default_rng(0).normal(size=(6, 7, 8)).astype("f4").cumsum(axis=2)
@@ -144,6 +145,7 @@ def test_vtk_reads_hdf5_through_the_filter(program: str, tmp_path: Path) -> None
     assert np.abs(decoded - values).max() <= 0.25
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("lod", [0, 1])
 def test_to_vtk_has_the_values_at_their_positions(run: Path, lod: int) -> None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -161,6 +163,7 @@ def test_to_vtk_has_the_values_at_their_positions(run: Path, lod: int) -> None:
     assert grid.GetCellData().GetArray("vtkGhostType").GetRange() == (0, 32)
 
 
+@pytest.mark.vtk
 def test_to_vtk_of_even_axes_is_an_image(whole: Path) -> None:
     with fhash_codec.open(whole) as volume:
         image = volume.to_vtk(1.5, ((5, 10), (0, 24), (4, 44)))
@@ -170,6 +173,7 @@ def test_to_vtk_of_even_axes_is_an_image(whole: Path) -> None:
     assert image.GetPointData().GetArray("vtkGhostType") is None
 
 
+@pytest.mark.vtk
 def test_pyvista_wraps_the_grid(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module: Any = ModuleType("pyvista")
     module.wrap = lambda grid: ("wrapped", grid.GetDimensions())

@@ -15,6 +15,7 @@ import numcodecs.zstd
 import numpy as np
 import pytest
 from hostile_files import DOCUMENT, edited, edited_header, read_everything, refused, replaced
+from rarely import rarely
 from several_files import PLAIN_VARIABLE, add_coordinates, compact_header, write_several
 from sharded_files import NAME
 from table_files import table_parts, write_table
@@ -495,7 +496,8 @@ def inflated(data: bytes) -> bytes | None:
     return text if stream.eof and not stream.unused_data else None
 
 
-def test_every_flip_is_refused_unless_a_document_inflates_to_the_same_text(sample) -> None:
+@pytest.mark.parametrize("part", [0, *rarely(1, 2, 3)])
+def test_every_flip_is_refused_unless_a_document_inflates_to_the_same_text(sample, part) -> None:
     sound = sample.read_bytes()
     contents, spans = read_everything(sample), deflated_spans(sample)
     choose = random.Random(0)
@@ -503,7 +505,7 @@ def test_every_flip_is_refused_unless_a_document_inflates_to_the_same_text(sampl
     last = [(end - 1, 1 << bit) for _, end in spans for bit in range(8)]
     flips = [(choose.randrange(len(sound)), choose.randrange(1, 256)) for _ in range(2000)]
     same = 0
-    for at, bits in [*flips, *last]:
+    for at, bits in [*flips, *last][part::4]:
         damaged = bytearray(sound)
         damaged[at] ^= bits
         sample.write_bytes(damaged)

@@ -22,6 +22,7 @@ from growing_file import (
     layer_values,
     streams_of,
 )
+from rarely import rarely
 from sharded_files import chunk_of, random_values, write_sharded
 from table_files import table_parts
 
@@ -478,16 +479,17 @@ def test_an_end_that_later_ones_took_the_place_of_is_changed_rather_than_damaged
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
-def test_killed_at_one_line_of_five_it_leaves_a_complete_file(tmp_path) -> None:
+@pytest.mark.parametrize("every", [25, *rarely(5)])
+def test_killed_at_some_lines_it_leaves_a_complete_file(tmp_path, every) -> None:
     result = subprocess.run(
-        [sys.executable, str(PROGRAM), str(tmp_path), "3", "5"],
+        [sys.executable, str(PROGRAM), str(tmp_path), "3", str(every)],
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         timeout=300,
     )
     assert result.returncode == 0, result.stderr
-    assert int(result.stdout) > 80
+    assert int(result.stdout) > 400 / every
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace", "link"])

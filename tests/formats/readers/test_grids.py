@@ -9,11 +9,8 @@ from typing import Any
 import mrcfile
 import nibabel
 import numpy as np
+import numpy.typing as npt
 import pytest
-from vtkmodules.util.numpy_support import numpy_to_vtk
-from vtkmodules.vtkCommonCore import vtkDoubleArray
-from vtkmodules.vtkCommonDataModel import vtkImageData, vtkRectilinearGrid
-from vtkmodules.vtkIOLegacy import vtkRectilinearGridWriter, vtkStructuredPointsWriter
 
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.registry import list_variables, open_series
@@ -173,37 +170,54 @@ def test_opendx(tmp_path: Path, binary: bool) -> None:
 
 
 def legacy(path: Path, *, even: bool, binary: bool, time: float) -> None:
-    """A legacy file of the first step, with a vector, numbers of cells and a time."""
-    grid: Any = vtkImageData() if even else vtkRectilinearGrid()
-    writer: Any = vtkStructuredPointsWriter() if even else vtkRectilinearGridWriter()
-    grid.SetDimensions(6, 5, 4)
-    if even:
-        grid.SetOrigin(1, 2, 3)
-        grid.SetSpacing(0.5, 0.25, 2)
-    else:
-        for count, put in (
-            (6, grid.SetXCoordinates),
-            (5, grid.SetYCoordinates),
-            (4, grid.SetZCoordinates),
-        ):
-            put(numpy_to_vtk(np.arange(count) ** 2.0, deep=1))
-    scalars = numpy_to_vtk(VALUES[0].ravel(), deep=1)
-    scalars.SetName("rho")
-    grid.GetPointData().SetScalars(scalars)
-    vectors = numpy_to_vtk(VALUES.reshape(3, -1).T.copy(), deep=1)
-    vectors.SetName("velocity")
-    grid.GetPointData().AddArray(vectors)
-    cells = numpy_to_vtk(np.arange(60, dtype="i4"), deep=1)
-    cells.SetName("cell id")
-    grid.GetCellData().SetScalars(cells)
-    stamp = vtkDoubleArray()
-    stamp.SetName("TimeValue")
-    stamp.InsertNextValue(time)
-    grid.GetFieldData().AddArray(stamp)
-    writer.SetInputData(grid)
-    writer.SetFileName(str(path))
-    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
-    assert writer.Write()
+    """A legacy file of the first step, with a vector, numbers of cells and a time, as of VTK."""
+
+    def of(values: npt.ArrayLike, kind: str) -> bytes:
+        array = np.asarray(values, kind).ravel()
+        text = " ".join(str(each) for each in array).encode()
+        return (array.tobytes() if binary else text) + b"\nMETADATA\nINFORMATION 0\n\n"
+
+    axes = b"".join(
+        b"%c_COORDINATES %d double\n" % (name, count) + of(np.arange(count) ** 2.0, ">f8")
+        for name, count in zip(b"XYZ", (6, 5, 4), strict=True)
+    )
+    path.write_bytes(
+        b"# vtk DataFile Version 5.1\nvtk output\n"
+        + (b"BINARY\n" if binary else b"ASCII\n")
+        + (b"DATASET STRUCTURED_POINTS\n" if even else b"DATASET RECTILINEAR_GRID\n")
+        + (b"FIELD FieldData 1\nTimeValue 1 1 double\n" + of(time, ">f8"))
+        + b"DIMENSIONS 6 5 4\n"
+        + (b"SPACING 0.5 0.25 2\nORIGIN 1 2 3\n" if even else axes)
+        + (b"CELL_DATA 60\nSCALARS cell%20id int\nLOOKUP_TABLE default\n")
+        + of(np.arange(60), ">i4")
+        + (b"POINT_DATA 120\nSCALARS rho float\nLOOKUP_TABLE default\n" + of(VALUES[0], ">f4"))
+        + (b"FIELD FieldData 1\nvelocity 3 120 float\n")
+        + of(VALUES.reshape(3, -1).T, ">f4")
+    )
+
+
+@pytest.mark.vtk
+@pytest.mark.parametrize("even", [True, False])
+@pytest.mark.parametrize("binary", [True, False])
+def test_vtk_reads_these_legacy_files(tmp_path: Path, even: bool, binary: bool) -> None:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOLegacy import vtkRectilinearGridReader, vtkStructuredPointsReader
+
+    legacy(tmp_path / "a.vtk", even=even, binary=binary, time=4.25)
+    reader: Any = vtkStructuredPointsReader() if even else vtkRectilinearGridReader()
+    reader.SetFileName(str(tmp_path / "a.vtk"))
+    reader.ReadAllVectorsOn()
+    reader.ReadAllFieldsOn()
+    reader.Update()
+    grid = reader.GetOutput()
+    assert grid.GetBounds() == ((1, 3.5, 2, 3, 3, 9) if even else (0, 25, 0, 16, 0, 9))
+    for holder, name, expected in (
+        (grid.GetPointData(), "rho", VALUES[0].ravel()),
+        (grid.GetPointData(), "velocity", VALUES.reshape(3, -1).T),
+        (grid.GetCellData(), "cell id", np.arange(60)),
+        (grid.GetFieldData(), "TimeValue", [4.25]),
+    ):
+        np.testing.assert_array_equal(vtk_to_numpy(holder.GetArray(name)), expected)
 
 
 @pytest.mark.parametrize("even", [True, False])

@@ -435,6 +435,7 @@ def test_descending_axes_come_back_ascending(tmp_path: Path, suffix: str) -> Non
         np.testing.assert_array_equal(np.stack(list(series.frames())), values[:, :, ::-1])
 
 
+@pytest.mark.vtk
 def test_vtk_takes_the_time_and_its_units(tmp_path: Path) -> None:
     xml = pytest.importorskip("vtkmodules.vtkIOXML")
     described = region({**EVEN, "t": [4.0]}, "f4")

@@ -133,6 +133,7 @@ def small(path: Path, *, grid: str = "", array: str = "", values: str = "0 1 2 3
     return path
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("header", [32, 64])
 @pytest.mark.parametrize("compressor", [None, "ZLib", "LZ4", "LZMA"])
@@ -159,6 +160,7 @@ def test_values_are_those_of_vtk(
             assert series.coords["z"].values.tolist() == [2.0, 4.0, 6.0]
 
 
+@pytest.mark.vtk
 def test_cells_lie_between_the_points(tmp_path: Path) -> None:
     path = vtk_files.write(tmp_path / "a.vti", vtk_files.image(ARRAYS, cells=True))
     with open_series(path, var="rho") as series:
@@ -166,6 +168,7 @@ def test_cells_lie_between_the_points(tmp_path: Path) -> None:
         assert series.coords["x"].values.tolist() == [0.625, 0.875, 1.125, 1.375, 1.625]
 
 
+@pytest.mark.vtk
 def test_a_layer_of_cells_lies_in_its_plane(tmp_path: Path) -> None:
     path = vtk_files.write(
         tmp_path / "a.vti", vtk_files.image({"u": ARRAYS["rho"][:1]}, cells=True)
@@ -175,6 +178,7 @@ def test_a_layer_of_cells_lies_in_its_plane(tmp_path: Path) -> None:
         assert series.coords["z"].values.tolist() == [2.0]
 
 
+@pytest.mark.vtk
 def test_components_by_name_and_by_number(tmp_path: Path) -> None:
     path = vtk_files.write(tmp_path / "a.vti", vtk_files.image({"v": ARRAYS["velocity"]}))
     with open_series(path, var="v.2") as series:
@@ -187,6 +191,7 @@ def test_components_by_name_and_by_number(tmp_path: Path) -> None:
         open_series(path, var="v.3")
 
 
+@pytest.mark.vtk
 def test_points_and_cells_of_one_name(tmp_path: Path) -> None:
     grid = vtk_files.image({"u": ARRAYS["rho"]})
     vtk_files.fill(grid, {"u": ARRAYS["rho"][:2, :3, :4]}, cells=True)
@@ -197,6 +202,7 @@ def test_points_and_cells_of_one_name(tmp_path: Path) -> None:
         open_series(path, var="u")
 
 
+@pytest.mark.vtk
 def test_rectilinear_grids(tmp_path: Path) -> None:
     model = pytest.importorskip("vtkmodules.vtkCommonDataModel")
     support = pytest.importorskip("vtkmodules.util.numpy_support")
@@ -232,6 +238,7 @@ def test_pieces_are_put_together(tmp_path: Path) -> None:
         series.read(0)
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("ghosts", [0, 1])
 def test_files_of_pieces_are_one_grid(tmp_path: Path, ghosts: int) -> None:
     xml = pytest.importorskip("vtkmodules.vtkIOParallelXML")
@@ -372,6 +379,7 @@ def _flipped(data: bytes) -> bytes:
     return data[:begin] + harmed + data[begin + 60 :]
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("damage", [_cut, _huge, _flipped])
 @pytest.mark.parametrize("compressor", [None, "ZLib", "LZMA"])
 @pytest.mark.parametrize("mode", ["appended", "base64"])
@@ -389,6 +397,7 @@ def test_damaged_files_end_in_one_line(
     assert str(path) in str(caught.value)
 
 
+@pytest.mark.vtk
 def test_a_file_that_only_begins_is_refused(tmp_path: Path) -> None:
     whole = vtk_files.write(
         tmp_path / "a.vti", vtk_files.image({"u": ARRAYS["rho"]}), compressor="ZLib"

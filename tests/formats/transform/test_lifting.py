@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rarely import rarely
 from reference.elementwise import OFFSET_UNIT, clip_shifted, dequantise
 from reference.kernels import KINDS, Table
 from reference.transforms import MAX_LOD, Transform, band_lengths, band_table
@@ -153,7 +154,7 @@ def test_any_mix_comes_back(
 @pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES, [1, 4]))
 @pytest.mark.parametrize("shape", [(3, 4, 9, 37), (1, 1, 16, 64), (4, 1, 1, 5)])
-@pytest.mark.parametrize("empty", ["last", "first", "planes", "but one", "all"])
+@pytest.mark.parametrize("empty", ["last", "planes", *rarely("first", "but one", "all")])
 def test_one_run_gives_the_bits_of_its_three_steps(
     shape: tuple[int, ...],
     kinds: tuple[str, ...],

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import regions
 import xarray
+from rarely import rarely
 from regions import COORDS, READ, SHAPE, labelled_region, region_of
 
 from fhash_formats.errors import (
@@ -64,7 +65,8 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "dtype", ["f4", "f8", "f2", ">f4", "i1", "u1", ">i2", "u2", "i4", "u4", "i8", "u8"]
+    "dtype",
+    ["f4", "f2", ">i2", "u8", *rarely("f8", ">f4", "i1", "u1", "u2", "i4", "u4", "i8")],
 )
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_the_values_come_back_exactly(tmp_path: Path, suffix: str, dtype: str) -> None:

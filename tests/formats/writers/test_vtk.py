@@ -81,6 +81,7 @@ def test_vtp(tmp_path: Path) -> None:
     assert (piece.get("NumberOfPoints"), piece.get("NumberOfPolys")) == ("4", "2")
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("suffix", ["vtp", "ply"])
 def test_vtk_reads_them(tmp_path: Path, suffix: str) -> None:
     module, name = {
@@ -280,6 +281,7 @@ def test_the_structure_of_the_specification(tmp_path: Path) -> None:
         assert (values.dtype, values.attrs["units"]) == (np.dtype("<f4"), "m/s")
 
 
+@pytest.mark.vtk
 @pytest.mark.parametrize("steps", [3, 1])
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "u1", "i2", "i8"])
 def test_vtk_reads_every_step(tmp_path: Path, dtype: str, steps: int) -> None:

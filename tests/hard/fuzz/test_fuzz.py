@@ -44,6 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
+@pytest.mark.hard
 def test_the_native_code_under_sanitizers(folder: Path) -> None:
     try:
         figures = run.fuzz(
@@ -64,6 +65,7 @@ def test_the_native_code_under_sanitizers(folder: Path) -> None:
     assert figures.edges > 3000
 
 
+@pytest.mark.hard
 def test_every_target_has_a_name_and_seeds(folder: Path) -> None:
     if not (folder / "corpus").exists():
         run.prepare(folder, EVERY)
@@ -126,6 +128,7 @@ def test_every_file_that_is_called_is_built() -> None:
     assert set(declarations.exported(others)) <= NOT_FUZZED.keys()
 
 
+@pytest.mark.hard
 def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fuzzer that sees nothing would pass all other tests."""
     source = (run.NATIVE / "quantise.cpp").read_text(encoding="utf-8")
@@ -154,6 +157,7 @@ def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     )
 
 
+@pytest.mark.hard
 def test_code_that_does_not_compile_is_no_reason_to_skip(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -629,7 +629,7 @@ class CudaDevice:
     def __init__(self, device: torch.device) -> None:
         """Look at a device; Unavailable where the driver cannot be called."""
         self._driver = Driver()
-        torch.cuda.init()  # type: ignore[no-untyped-call]
+        torch.cuda.init()
         index = torch.cuda.current_device() if device.index is None else device.index
         self._device = torch.device("cuda", index)
         # The first tensor makes the primary context.

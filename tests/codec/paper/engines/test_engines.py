@@ -7,7 +7,10 @@ from math import prod
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
 from pretended_cuda import CUDA, pretended_cuda
 from readable_paper import NaiveEngine, bucket_index, interpolate
 

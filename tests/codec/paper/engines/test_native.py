@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
 from engine_checks import assert_near
 from pretended_cuda import pretended_cuda
 from readable_paper import NaiveEngine

@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
 from frame_field import NETWORK_SCENES, SCENES, FrameField
 from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
@@ -31,7 +34,7 @@ OF_A_PICTURE = 8
 """Waits of a picture besides those of its passes: the rays at the start, counters, and results."""
 WAITS = 8
 """Waits that a pass may take."""
-WAITS_WITH_SURFACES = 14
+WAITS_WITH_SURFACES = 15
 """Waits that a pass may take with surfaces, whose search ends when all of a pass are found."""
 FRAMES = ("plain", "surfaces", "maximum", "graded", "all light")
 NETWORKS = ("plain", "between", "central", "graded", "surfaces", "attenuated", "unskipped")

@@ -12,11 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from readable_paper import NaiveEngine
 
-from fhash_codec.paper.engines.fused.engine import FusedEngine
-from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.network import Architecture
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -41,6 +37,12 @@ def emulated(library_folder):
 @pytest.fixture
 def engines_of(noise_coreset, emulated):
     """A function of a shape, settings and a device: coreset, fused engine, slab, and the oracle."""
+
+    import torch
+    from readable_paper import NaiveEngine
+
+    from fhash_codec.paper.engines.fused.engine import FusedEngine
+    from fhash_codec.paper.engines.slab import SlabEngine
 
     def make(shape, settings, steps=40, **device):
         settings = dict(settings)

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get("FHASH_HARD") != "1", reason="minutes under AddressSanitizer; make hard runs it"
-)
+pytestmark = [pytest.mark.torch, pytest.mark.every]
 
 TRIAL = Path(__file__).parent / "bounds_trial.py"
 

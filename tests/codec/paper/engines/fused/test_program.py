@@ -11,7 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
 
 from fhash_codec.paper.engines.fused import engine as points
 from fhash_codec.paper.engines.fused import program as driver_module
