@@ -59,8 +59,8 @@ struct Task {
 };
 
 // The kernels of a path. `run`: values of the points, derivatives (n, 4) where `slopes` is not
-// null, and those by the inputs (inputs, n) where `by_inputs` is not. `still`: the numbers of a part
-// at one time, between its two time nodes around it.
+// null, and those by the inputs (inputs, n) where `by_inputs` is not. `still`: the numbers of a
+// part at one time, between its two time nodes around it.
 #define FHASH_POINT_KERNELS(NAME)                                                                \
     std::int64_t run_##NAME(const Task& task, const Points& points, std::int64_t count,          \
                             float* values, float* slopes, float* by_inputs);                     \

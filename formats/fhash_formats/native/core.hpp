@@ -59,9 +59,9 @@ constexpr std::int64_t FHASH_ABI = 17;
 
 // FHASH_CLONES before a function: compiled for AVX2 and the baseline; one is chosen when the
 // library is loaded. It works on plain functions only, neither templates nor inlines: put the body
-// into a FHASH_INLINE template and call that from a small cloned function per type. It is for loops that
-// the compiler vectorises; target.hpp is for large sources. Elsewhere it is empty: ARM (where NEON
-// is the baseline), musl, macOS, Windows, older compilers, and Clang, whose clones leave out a
+// into a FHASH_INLINE template and call that from a small cloned function per type. It is for loops
+// that the compiler vectorises; target.hpp is for large sources. Elsewhere it is empty: ARM (where
+// NEON is the baseline), musl, macOS, Windows, older compilers, and Clang, whose clones leave out a
 // constructor that they inline, so that the library cannot be loaded.
 // FHASH_CLONES_512: for AVX-512 too, for sums of products, which take half of the time by it.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && !defined(__clang__) && \

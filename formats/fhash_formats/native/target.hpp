@@ -3,7 +3,7 @@
 // Sources in which each instruction counts are compiled for the baseline of x86-64 and for AVX2: by
 // a file that defines FHASH_TARGET as 3 (x86-64-v3) or 4 (x86-64-v4) and includes the source. GCC
 // takes vectors apart before it inlines a function into one for another processor, so FHASH_CLONES
-// of one function would work number by number. Both have the same bits.
+// of one function would work number by number. Both have the same bits; the baseline is at -O2.
 //
 // Include this last. What is included before is compiled for the baseline, and so must be: the
 // headers of the standard library, of which a copy for AVX2 could be linked into code for any
@@ -39,9 +39,9 @@
 #pragma GCC target("tune=haswell")
 #endif
 #endif
-#else
-#pragma GCC optimize("O1")  // the baseline
 #endif
+#elif defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("O3")  // the only target there
 #endif
 
 // FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS) { ... }: the exported function NAME, which returns
