@@ -90,7 +90,8 @@ def _grown_settings() -> Any:
 
 
 def file_limit(size: int) -> None:
-    """Limit the length of files. SIGXFSZ is ignored, as Python does by default."""
+    """Limit the length of files, bytecode left out. SIGXFSZ is ignored, as Python does."""
+    sys.dont_write_bytecode = True
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 

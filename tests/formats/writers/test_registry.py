@@ -262,6 +262,7 @@ coords = {axis: Coordinate(name=axis, values=np.arange(float(n))) for axis, n in
 region = Region(name="wind", dtype=np.dtype("f4"), shape=shape, coords=coords)
 data = np.random.default_rng(0).normal(size=shape).astype("f4")
 seen = {}
+sys.dont_write_bytecode = True  # the limit would cut what later imports of other tests read
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
 for suffix in sys.argv[3:]:
     try:
