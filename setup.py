@@ -144,8 +144,8 @@ class BuildNative(build_ext):
             if self.compiler.compiler_type != "msvc":  # that one initialises itself on the way
                 self._compile_in(pool)
             self._build_extensions()
-        if self.compiler.compiler_type != "msvc":
-            self._keep_sizes()
+        if self.compiler.compiler_type != "msvc" and "CXX" not in os.environ:
+            self._keep_sizes()  # of the usual compiler
 
     def _compile_in(self, pool: ThreadPoolExecutor) -> None:
         compile_some = self.compiler.compile

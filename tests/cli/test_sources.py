@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import resource
-import sys
 import shutil
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
