@@ -34,10 +34,14 @@ OF_A_PICTURE = 8
 """Waits of a picture besides those of its passes: the rays at the start, counters, and results."""
 WAITS = 8
 """Waits that a pass may take."""
-WAITS_WITH_SURFACES = 15
+WAITS_WITH_SURFACES = 14
 """Waits that a pass may take with surfaces, whose search ends when all of a pass are found."""
 FRAMES = ("plain", "surfaces", "maximum", "graded", "all light")
-NETWORKS = ("plain", "between", "central", "graded", "surfaces", "attenuated", "unskipped")
+ONE_WAIT_TOO_MANY = pytest.mark.xfail(strict=True, reason="43 waits in 3 passes, where 42 may be")
+NETWORKS = (
+    *("plain", "between", "graded", "surfaces", "attenuated", "unskipped"),
+    pytest.param("central", marks=ONE_WAIT_TOO_MANY),
+)
 
 
 def assert_a_pass_waits_little(planned: Planned, path: Path, scene: dict[str, Any]) -> None:
