@@ -123,15 +123,93 @@ def test_odd_chunks(values: npt.NDArray[Any], words: dict[str, Any], tmp_path: P
         assert_kept(file["v"][...], values, 0.5)
 
 
-def test_the_fill_value_takes_no_part_in_a_relative_bound(tmp_path: Path) -> None:
-    values = np.linspace(0, 1, 600, dtype="f4").reshape(20, 30) + noise((20, 30), "f4") / 100
-    values = np.nan_to_num(values)
-    values[5:9, 3:20] = -1e20
-    words = {"fillvalue": -1e20, "chunks": (20, 30)}
-    store(tmp_path / "a.h5", values, Transform(max_error_rel=0.01), **words)
+@pytest.mark.parametrize("bound", [{"max_error": 0.02}, {"max_error_rel": 0.01}, {"step": 0.05}])
+@pytest.mark.parametrize(
+    ("fill", "words"),
+    [
+        (-1e20, {"fillvalue": -1e20}),
+        (0.5, {"fillvalue": 0.5}),  # among the values
+        (np.nan, {"fillvalue": np.nan}),
+        (9.969209968386869e36, {}),  # an attribute says it, which no filter sees
+        (-999, {}),
+        (0.5, {"missing": [0.5]}),
+        (0.25, {"missing": [0.5, 0.25], "fillvalue": -1}),
+    ],
+)
+@pytest.mark.parametrize("kind", ["<f4", ">f8"])
+def test_missing_values_come_back_and_weaken_no_bound(
+    fill: float, words: dict[str, Any], bound: dict[str, float], kind: str, tmp_path: Path
+) -> None:
+    y, x = np.mgrid[0:20, 0:30]
+    values = (np.sin(x / 7) * np.cos(y / 5)).astype(kind)
+    gone = (np.abs(y - 9) < 4) & (np.abs(x - 12) < 9)
+    values[gone] = fill
+    words, missing = dict(words), words.get("missing", ())
+    words.pop("missing", None)
+    store(
+        tmp_path / "a.h5", values, Transform(**bound, missing=missing), chunks=(12, 30), **words
+    )
     with h5py.File(tmp_path / "a.h5") as file:
-        known = values > -1
-        assert np.abs(file["v"][...] - values)[known].max() <= 0.02
+        found = file["v"][...]
+    assert found[gone].tobytes() == values[gone].tobytes()
+    error = np.abs(found - values)[~gone].max()
+    assert error <= {"max_error": 0.02, "max_error_rel": 0.02}.get(next(iter(bound)), 0.2)
+
+
+def test_packed_numbers_keep_their_fill_value(tmp_path: Path) -> None:
+    y, x = np.mgrid[0:20, 0:30]
+    values = (4000 * np.sin(x / 7) * np.cos(y / 5)).astype("i2")
+    values[3:9, 4:20] = 17
+    store(tmp_path / "a.h5", values, Transform(max_error=9), chunks=(20, 30), fillvalue=17)
+    with h5py.File(tmp_path / "a.h5") as file:
+        found = file["v"][...]
+    assert np.array_equal(found == 17, values == 17)
+    assert np.abs(found.astype(int) - values).max() <= 9
+
+
+@pytest.mark.parametrize("fill", [-999, None])
+def test_rows_that_nobody_wrote_yet_are_the_fill_value(fill: float | None, tmp_path: Path) -> None:
+    values = np.nan_to_num(noise((21, 11, 13), "f4") / 50 - 3)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        data = file.create_dataset(
+            "v",
+            shape=(2, 11, 13),
+            maxshape=(None, 11, 13),
+            chunks=(7, 11, 13),
+            dtype="f4",
+            fillvalue=fill,
+            **Transform(max_error=0.01),
+        )
+        for end in (3, 9, 21):
+            data.resize(end, 0)
+            data[end - 2 : end, :6] = values[end - 2 : end, :6]
+        found = data[...]
+    written = np.zeros(values.shape, bool)
+    for end in (3, 9, 21):
+        written[end - 2 : end, :6] = True
+    assert (found[~written] == (fill or 0)).all()
+    assert np.abs(found - values)[written].max() <= 0.01
+
+
+def test_a_copy_of_a_dataset_knows_its_missing_values(tmp_path: Path) -> None:
+    """h5repack hands the numbers of the dataset on, whose fill value says nothing of others."""
+    y, x = np.mgrid[0:20, 0:30]
+    values = np.sin(x / 7 + y).astype("f4")
+    values[y > 14] = 0.5
+    store(tmp_path / "a.h5", values, Transform(max_error=0.01, missing=[0.5]), chunks=(20, 30))
+    run("h5repack", "-l", "v:CHUNK=15x11", tmp_path / "a.h5", tmp_path / "b.h5")
+    with h5py.File(tmp_path / "b.h5") as file:
+        found = file["v"][...]
+    assert np.array_equal(found == 0.5, values == 0.5)
+    assert np.abs(found - values).max() <= 0.02
+
+
+def test_missing_values_of_another_type_are_refused(tmp_path: Path) -> None:
+    values = np.arange(600, dtype="i2").reshape(20, 30)
+    with pytest.raises(ValueError, match="missing value -999.5 is no number of the dataset"):
+        store(tmp_path / "a.h5", values, Transform(max_error=1, missing=[-999.5]), chunks=(20, 30))
+    with pytest.raises(InputError, match="9 missing values; at most 8"):
+        Transform(max_error=1, missing=range(9))
 
 
 @pytest.mark.parametrize(

@@ -32,12 +32,6 @@ from reference.kernels import (
     single_band,
 )
 
-_MARKS = 4
-"""Labels of missing values."""
-_MISSING_VALUES = (np.nan, np.inf, -np.inf)
-"""Values with the labels 1, 2 and 3."""
-
-
 def build_stream(
     kind: int,
     settings: TileSettings | None,
@@ -110,8 +104,13 @@ def unpack_planes(data: bytes | memoryview, count: int, dtype: np.dtype[Any]) ->
 
 def pack_missing(values: Values, finite: Mask) -> bytes:
     """The section of missing values. finite: where the values are finite."""
-    marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3)))
-    return encode_labels(marks, _MARKS)
+    plain = np.where(np.isnan(values), np.asarray(np.nan, values.dtype), values)
+    bits = plain.view(f"u{values.dtype.itemsize}")
+    palette = np.unique(bits[~finite])
+    marks = np.where(finite, 0, np.searchsorted(palette, bits) + 1)
+    little = palette.astype(palette.dtype.newbyteorder("<"))
+    head = bytes([palette.size]) + little.tobytes()
+    return head + encode_labels(marks, palette.size + 1)
 
 
 def restore_missing(decoded: Values, missing: bytes | memoryview | None) -> Values:
@@ -120,12 +119,19 @@ def restore_missing(decoded: Values, missing: bytes | memoryview | None) -> Valu
     missing: the section; empty or None where nothing is missing. Raises DamagedFileError.
     """
     if missing:
-        if decoded.dtype.kind != "f":
-            raise DamagedFileError("a coded tile of integers has missing values")
-        marks = decode_labels(missing, _MARKS, decoded.shape)
-        for mark, value in enumerate(_MISSING_VALUES, start=1):
-            decoded[marks == mark] = value
+        palette, coded = missing_palette(missing, decoded.dtype)
+        marks = decode_labels(coded, palette.size + 1, decoded.shape)
+        decoded[marks > 0] = palette[marks[marks > 0] - 1]
     return decoded
+
+
+def missing_palette(section: bytes | memoryview, dtype: np.dtype[Any]) -> tuple[Values, memoryview]:
+    """The values of a section of missing values, and the labels after them."""
+    end = 1 + section[0] * dtype.itemsize
+    bits = np.frombuffer(section[1:end], f"<u{dtype.itemsize}")
+    if end > len(section) or np.any(bits[1:] <= bits[:-1]):
+        raise DamagedFileError("the missing values of a coded tile are cut, or do not ascend")
+    return bits.astype(f"u{dtype.itemsize}").view(dtype), memoryview(section)[end:]
 
 
 def labelled_stream(

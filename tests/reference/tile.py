@@ -138,7 +138,7 @@ def decode_tile(
         limits = np.iinfo(dtype)
         sums = [min(max(int(v) + stream.origin, limits.min), limits.max) for v in values.flat]
         values = np.array(sums, dtype).reshape(stream.shape)
-    return values, mask
+    return with_missing(values, stream.sections.get("missing"), stream.shape), mask
 
 
 def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
@@ -166,12 +166,21 @@ def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
         if settings["clip"]:
             low, high = (in_type(end, dtype) for end in settings["range"])
             values = np.where(values < low, low, np.where(values > high, high, values))
-    values = blanked(values, mask, settings)
-    if "missing" in sections:
-        marks = LabelDecoder(sections["missing"], 4, stream.shape).run()
-        for mark, value in ((1, np.nan), (2, np.inf), (3, -np.inf)):
-            values[marks == mark] = value
-    return values, mask
+    return blanked(values, mask, settings), mask
+
+
+def with_missing(values: Values, section: memoryview | None, shape: Sequence[int]) -> Values:
+    """Decoded values with the missing ones in their places, which are kept bit by bit."""
+    if section is None:
+        return values
+    size = values.dtype.itemsize
+    palette, end = [], 1 + section[0] * size
+    for first in range(1, end, size):
+        palette.append(int.from_bytes(section[first : first + size], "little"))
+    assert palette == sorted(set(palette))
+    marks = LabelDecoder(section[end:], len(palette) + 1, shape).run()
+    bits = np.array([0, *palette], f"u{size}")[marks]
+    return np.where(marks > 0, bits.view(values.dtype), values)
 
 
 def unpack_differences(body: memoryview, shape: Sequence[int], dtype: np.dtype[Any]) -> Values:

@@ -18,7 +18,8 @@ constexpr double FIRST_RATIO = 2.5;   // step under a bound, in units of half th
 constexpr double OTHER_RATIOS[] = {4.0, 1.6};
 constexpr int CLEARLY = 4;  // ratio of a deflated tile to its labels: nothing else is tried
 constexpr int64_t MAX_WINDOW = 1 << 16;       // values on which settings are tried at effort 2
-constexpr int WRITTEN = 4;                    // bounds that decoded fill values are away at most
+constexpr int32_t MAX_MISSING = 16;  // that a caller names; with others, at most MAX_MARKED
+constexpr size_t FAR_VALUES = 4;  // _FillValue, missing_value and two flags, at either end
 constexpr double QUANTUM_SHARE = 1 - 1e-6;    // of twice the largest error, for its rounding
 constexpr double MAX_STEPS = 2.5e8;           // largest coefficient, as estimated, in steps
 constexpr double MAX_VALUE = 1e300, MIN_STEP = 1e-290;
@@ -104,18 +105,17 @@ struct Draft {
     }
 };
 
-// A tile to code, of at least one finite value.
+// A tile to code, of at least one value that is not marked.
 struct Task {
     fhash_context& context;
     Shape shape;
     int32_t type;
     const uint8_t* values;
     const fhash_quality& quality;
-    std::vector<uint8_t> finite;  // empty where all are
+    Marks marks;  // of what comes back bit by bit, and takes no part in range and bound
     Wide origin;
-    double low, high;      // of the finite values, less the origin
+    double low, high;      // of the other values, less the origin
     int64_t whole_low, whole_high;  // the same, of integers
-    double ends[2];        // of the range that a relative bound is of
     double error, reach;   // bound on decoded values, below 0 for none; and before they are rounded
     bool signed_zero;      // a zero has a sign, or a value is below 0
 
@@ -130,74 +130,106 @@ struct Task {
     double largest() const { return std::max(std::fabs(low), std::fabs(high)); }
 };
 
-// Values without those that stood for `fill` in a tile that was coded before: who writes a part of
-// a tile codes what was decoded of the rest once more.
-void drop_moved(std::vector<double>& values, double fill, double fraction) {
-    if (values.empty()) return;
-    const auto span = [](const std::vector<double>& of) {
-        const auto ends = std::minmax_element(of.begin(), of.end());
-        return *ends.second - *ends.first;
-    };
-    const double near = fraction * span(values);
-    std::vector<double> others;
-    double farthest = -1;
-    for (const double value : values) {
-        const double way = std::fabs(value - fill);
-        if (way <= near) farthest = std::max(farthest, way);
-        else others.push_back(value);
-    }
-    if (farthest < 0 || others.empty()) return;
-    if (farthest <= WRITTEN * (fraction * span(others))) values = std::move(others);
+// Whether whole planes along an axis are zeros, by axis and place: where nothing was written yet,
+// stores have zeros unless they have another fill value.
+template <class O> std::array<std::vector<bool>, 4> zero_planes(const Task& task, const O* values) {
+    std::array<std::vector<int64_t>, 4> others;
+    for (size_t axis = 0; axis < 4; axis++) others[axis].assign((size_t)task.shape[axis], 0);
+    int64_t i = 0;
+    for (int64_t t = 0; t < task.shape[0]; t++)
+        for (int64_t z = 0; z < task.shape[1]; z++)
+            for (int64_t y = 0; y < task.shape[2]; y++)
+                for (int64_t x = 0; x < task.shape[3]; x++, i++) {
+                    const int64_t there = bits_of(values[i]) != 0;
+                    const int64_t place[4] = {t, z, y, x};
+                    for (size_t axis = 0; axis < 4; axis++)
+                        others[axis][(size_t)place[axis]] += there;
+                }
+    std::array<std::vector<bool>, 4> zeros;
+    for (size_t axis = 0; axis < 4; axis++)
+        for (const int64_t count : others[axis]) zeros[axis].push_back(count == 0);
+    return zeros;
 }
 
-// The values that a store may have put there: the fill value, and values that are the only one of a
-// plane at either end of an axis.
-template <class O> std::vector<O> fills_of(const Task& task, const O* values, const void* fill) {
-    std::vector<O> fills;
-    if (fill) {
-        fills.emplace_back();
-        std::memcpy(&fills[0], fill, sizeof(O));
-    }
-    for (size_t axis = 0; axis < 4; axis++) {
-        int64_t inner = 1, outer = 1;
-        for (size_t a = 0; a < axis; a++) outer *= task.shape[a];
-        for (size_t a = axis + 1; a < 4; a++) inner *= task.shape[a];
-        for (const int64_t end : {(int64_t)0, task.shape[axis] - 1}) {
-            const O first = values[end * inner];
-            bool same = true;
-            for (int64_t o = 0; o < outer && same; o++)
-                for (int64_t i = 0; i < inner && same; i++)
-                    same = real(values[(o * task.shape[axis] + end) * inner + i]) == real(first);
-            if (same) fills.push_back(first);
-        }
-    }
-    return fills;
-}
-
-// Ends of the range of the values that are no fill values, less the origin; 0 and 0 for none.
-template <class O> void find_ends(Task& task, const O* values, const void* fill) {
-    const auto fills = fills_of(task, values, fill);
-    const auto number = [&](const O& value) {
-        if constexpr (is_real<O>) return real(value);
-        else return task.origin.zero() ? real(value)
-                                       : (double)(int64_t)((uint64_t)value - task.origin.bits);
+// Values at the ends of the range that are farther from all others than these are from each other,
+// such as -999 in a file that says so where no coder looks. They would cost bytes, and weaken a
+// relative bound.
+template <class O> std::vector<O> far_values(const Task& task, const O* values) {
+    std::vector<O> ends[2];  // the least different values ascending, and the largest descending
+    const auto take = [](std::vector<O>& of, const O& value, auto before) {
+        if (of.size() > FAR_VALUES && !before(value, of.back())) return;
+        const auto at = std::lower_bound(of.begin(), of.end(), value, before);
+        if (at != of.end() && !before(value, *at)) return;
+        of.insert(at, value);
+        if (of.size() > FAR_VALUES + 1) of.pop_back();
     };
-    const auto same = [](const O& one, const O& other) {
-        if constexpr (is_real<O>) return real(one) == real(other);
-        else return one == other;
-    };
-    std::vector<double> kept;
+    const auto less = [](const O& a, const O& b) { return value_of(a) < value_of(b); };
+    const auto more = [](const O& a, const O& b) { return value_of(a) > value_of(b); };
     for (int64_t i = 0; i < task.size(); i++) {
-        const bool is_fill = std::any_of(fills.begin(), fills.end(),
-                                         [&](const O& one) { return same(one, values[i]); });
-        if (std::isfinite(real(values[i])) && !is_fill) kept.push_back(number(values[i]));
+        if (!task.marks.of.empty() && task.marks.of[(size_t)i]) continue;
+        take(ends[0], values[i], less);
+        take(ends[1], values[i], more);
     }
-    for (const O& one : fills) drop_moved(kept, number(one), task.quality.max_error_rel);
-    task.ends[0] = task.ends[1] = 0;
-    if (kept.empty()) return;
-    const auto ends = std::minmax_element(kept.begin(), kept.end());
-    task.ends[0] = *ends.first;
-    task.ends[1] = *ends.second;
+    std::vector<O> far;
+    size_t best[2] = {0, 0};  // values of either end that are far, of which as many as possible
+    for (size_t i = 0; i < ends[0].size(); i++)
+        for (size_t j = 0; j < ends[1].size(); j++) {
+            const double low = real(ends[0][i]), high = real(ends[1][j]), range = high - low;
+            const bool far_low = i == 0 || low - real(ends[0][i - 1]) > range;
+            const bool far_high = j == 0 || real(ends[1][j - 1]) - high > range;
+            if (range >= 0 && far_low && far_high && i + j > best[0] + best[1]) {
+                best[0] = i;
+                best[1] = j;
+            }
+        }
+    for (int side = 0; side < 2; side++)
+        far.insert(far.end(), ends[side].begin(), ends[side].begin() + (int64_t)best[side]);
+    return far;
+}
+
+// Marks the values that are not finite, those that the caller calls missing, those that nobody
+// wrote, and those far from all others. false where the bits of so many cannot be kept.
+template <class O> bool mark_all(Task& task, const O* values, const void* missing, size_t count) {
+    const int64_t n = task.size();
+    const bool every_bit = task.quality.max_error == 0;
+    if (!mark_not_finite(values, task.type, n, every_bit, task.marks)) return false;
+    if (every_bit) return true;
+    const auto mark_bits = [&](const std::vector<uint64_t>& wanted) {
+        for (int64_t i = 0; i < n && !wanted.empty(); i++) {
+            const uint64_t bits = bits_of(values[i]);
+            if (std::find(wanted.begin(), wanted.end(), bits) != wanted.end() &&
+                !mark(bits, i, n, task.marks))
+                return false;
+        }
+        return true;
+    };
+    std::vector<uint64_t> wanted;
+    for (size_t i = 0; i < count; i++) {
+        O value;
+        std::memcpy(&value, (const uint8_t*)missing + i * sizeof(O), sizeof(O));
+        if (std::isfinite(real(value))) wanted.push_back(bits_of(value));
+    }
+    if (!mark_bits(wanted)) return false;
+    const auto zeros = zero_planes(task, values);
+    const auto has = [&](bool kind) {
+        return std::any_of(zeros.begin(), zeros.end(), [&](const std::vector<bool>& planes) {
+            return std::find(planes.begin(), planes.end(), kind) != planes.end();
+        });
+    };
+    if (has(true) && has(false)) {
+        int64_t i = 0;
+        for (int64_t t = 0; t < task.shape[0]; t++)
+            for (int64_t z = 0; z < task.shape[1]; z++)
+                for (int64_t y = 0; y < task.shape[2]; y++)
+                    for (int64_t x = 0; x < task.shape[3]; x++, i++)
+                        if ((zeros[0][(size_t)t] || zeros[1][(size_t)z] || zeros[2][(size_t)y] ||
+                             zeros[3][(size_t)x]) &&
+                            !mark(0, i, n, task.marks))
+                            return false;
+    }
+    wanted.clear();
+    for (const O& value : far_values(task, values)) wanted.push_back(bits_of(value));
+    return mark_bits(wanted);
 }
 
 // The middle of a range of 64-bit integers of which some are beyond 2^53; 0 for others.
@@ -224,26 +256,16 @@ template <class O> void set_origin(Task& task, O low, O high) {
     }
 }
 
-// Range, bound and missing values; false where no value is finite.
-template <class O> bool survey(Task& task, const O* values, const void* fill) {
+// Range of the values that are not marked; false where all are.
+template <class O> bool survey(Task& task, const O* values) {
     bool any = false;
     O low{}, high{};
     task.signed_zero = false;
     for (int64_t i = 0; i < task.size(); i++) {
-        const double value = real(values[i]);
-        if (!std::isfinite(value)) {
-            if (task.finite.empty()) task.finite.assign((size_t)task.size(), 1);
-            task.finite[(size_t)i] = 0;
-            continue;
-        }
-        if constexpr (is_real<O>) {
-            task.signed_zero |= std::signbit(value);
-            if (!any || value < real(low)) low = values[i];
-            if (!any || value > real(high)) high = values[i];
-        } else {
-            if (!any || values[i] < low) low = values[i];
-            if (!any || values[i] > high) high = values[i];
-        }
+        if (!task.marks.of.empty() && task.marks.of[(size_t)i]) continue;
+        if constexpr (is_real<O>) task.signed_zero |= std::signbit(real(values[i]));
+        if (!any || value_of(values[i]) < value_of(low)) low = values[i];
+        if (!any || value_of(values[i]) > value_of(high)) high = values[i];
         any = true;
     }
     if (!any) return false;
@@ -253,7 +275,6 @@ template <class O> bool survey(Task& task, const O* values, const void* fill) {
     } else {
         set_origin(task, low, high);
     }
-    if (task.quality.max_error_rel > 0) find_ends(task, values, fill);
     return true;
 }
 
@@ -265,9 +286,9 @@ void set_bound(Task& task) {
     if (quality.step > 0) return;
     task.error = std::max(quality.max_error, 0.0);
     if (quality.max_error_rel > 0) {
-        const double fraction = quality.max_error_rel, span = task.ends[1] - task.ends[0];
+        const double fraction = quality.max_error_rel, span = task.high - task.low;
         task.error = std::isfinite(span) ? fraction * span
-                                         : fraction * task.ends[1] - fraction * task.ends[0];
+                                         : fraction * task.high - fraction * task.low;
     }
     if (task.whole()) {
         task.reach = std::floor(task.error) + 0.5;
@@ -286,16 +307,17 @@ struct Trial {
     Coded coded;
     bool whole = false;  // the window was the tile
 
-    bool run(const Task& task, const uint8_t* values, const Shape& shape, fhash_error& error) {
+    bool run(const Task& task, const uint8_t* values, const Marks& marks, const Shape& shape,
+             fhash_error& error) {
         const auto settings = draft.settings(task.context, error);
         whole = shape == task.shape;
         return settings && encode_tile(task.context, settings, shape, task.type, values, nullptr,
-                                       coding, coded, error);
+                                       marks, coding, coded, error);
     }
 };
 
-// A block of at most `most` values from the middle of a tile.
-Buffer window_of(const Task& task, int64_t most, Shape& lengths) {
+// A block of at most `most` values from the middle of a tile, and their marks.
+Buffer window_of(const Task& task, int64_t most, Shape& lengths, Marks& marks) {
     lengths = task.shape;
     while (vertices(lengths) > most) {
         auto longest = std::max_element(lengths.begin(), lengths.end());
@@ -305,14 +327,18 @@ Buffer window_of(const Task& task, int64_t most, Shape& lengths) {
     int64_t start[4];
     for (size_t a = 0; a < 4; a++) start[a] = (task.shape[a] - lengths[a]) / 2;
     Buffer window;
+    marks.values = task.marks.values;
     for (int64_t t = 0; t < lengths[0]; t++)
         for (int64_t z = 0; z < lengths[1]; z++)
             for (int64_t y = 0; y < lengths[2]; y++) {
                 const int64_t row = ((start[0] + t) * task.shape[1] + start[1] + z) *
                                         task.shape[2] + start[2] + y;
-                const uint8_t* const from =
-                    task.values + (size_t)(row * task.shape[3] + start[3]) * width;
+                const int64_t first = row * task.shape[3] + start[3];
+                const uint8_t* const from = task.values + (size_t)first * width;
                 window.insert(window.end(), from, from + (size_t)lengths[3] * width);
+                if (task.marks.of.empty()) continue;
+                const uint16_t* const of = task.marks.of.data() + first;
+                marks.of.insert(marks.of.end(), of, of + lengths[3]);
             }
     return window;
 }
@@ -323,9 +349,10 @@ bool best_trial(const Task& task, const std::vector<Spec>& specs, int64_t most, 
     const bool bounded = task.error >= 0;
     if (specs.size() == 1 && !bounded) return true;
     Shape lengths;
-    const Buffer window = window_of(task, most, lengths);
+    Marks marks;
+    const Buffer window = window_of(task, most, lengths, marks);
     const auto take_better = [&](Trial trial, bool first) {
-        if (!trial.run(task, window.data(), lengths, error)) return false;
+        if (!trial.run(task, window.data(), marks, lengths, error)) return false;
         if (first || trial.coded.data.size() < best.coded.data.size()) best = std::move(trial);
         return true;
     };
@@ -383,12 +410,12 @@ bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, C
     const double gain = *std::max_element(norms.tz.begin(), norms.tz.end()) *
                         *std::max_element(norms.yx.begin(), norms.yx.end());
     if (task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
-    if (!trial.whole && !trial.run(task, task.values, task.shape, error)) return false;
+    if (!trial.whole && !trial.run(task, task.values, task.marks, task.shape, error)) return false;
     coded = std::move(trial.coded);
     return true;
 }
 
-// A tile whose finite values all decode to one value.
+// A tile whose values all decode to one value, but for marked ones.
 bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
               fhash_error& error) {
     const int64_t whole = origin.zero() ? 0 : (int64_t)center;
@@ -398,7 +425,7 @@ bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
     const fhash_coding coding = {0, -1, 0, 0, 1, 0, 1, 1, 1, 0};
     const std::vector<uint8_t> nothing((size_t)task.size(), 0);
     return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
-                                   nothing.data(), coding, coded, error);
+                                   nothing.data(), task.marks, coding, coded, error);
 }
 
 bool exactly(const Task& task, Coded& coded, fhash_error& error) {
@@ -416,9 +443,11 @@ bool encode_constant(const Task& task, Coded& coded, bool& done, fhash_error& er
     const bool sign = task.error == 0 && task.low == 0 && task.signed_zero;
     done = !sign && with_type(task.type, [&](auto value) {
         using O = decltype(value);
+        std::vector<uint8_t> counted;
+        for (const uint16_t mark : task.marks.of) counted.push_back(mark == 0);
         return is_within((const O*)(const void*)task.values,
                          (const O*)(const void*)coded.decoded.data(),
-                         task.finite.empty() ? nullptr : task.finite.data(), task.size(),
+                         counted.empty() ? nullptr : counted.data(), task.size(),
                          std::max(task.error, 0.0));
     });
     if (done || !equal) return true;
@@ -504,20 +533,27 @@ bool check_quality(const fhash_quality* quality, fhash_error& error) {
 }  // namespace
 
 bool encode_quality(fhash_context& context, const fhash_tile* tile, const void* values,
-                    const fhash_quality* quality, const void* fill, Coded& coded,
+                    const fhash_quality* quality, const void* missing, int32_t count, Coded& coded,
                     fhash_error& error) {
     if (!tile || !values || !is_shape(tile->shape) || !fhash_type_size(tile->type) ||
         tile->settings)
         return fail(error, FHASH_ERROR_ARGUMENT,
                     "a tile to encode has values, a type, four lengths, and no settings");
     if (!check_quality(quality, error)) return false;
+    if (count < 0 || (count && !missing) || count > MAX_MISSING)
+        return fail(error, FHASH_ERROR_ARGUMENT, "%d missing values; 0 to %d are possible", count,
+                    MAX_MISSING);
     Task task = {context, {}, tile->type, (const uint8_t*)values, *quality, {}, {}, 0, 0, 0, 0,
-                 {0, 0}, -1, 0, false};
+                 -1, 0, false};
     std::copy_n(tile->shape, 4, task.shape.begin());
     if (!may_use(context, 96 * (uint64_t)task.size(), error)) return false;
-    const bool any = with_type(task.type, [&](auto value) {
-        return survey(task, (const decltype(value)*)values, fill);
+    bool kept = true;
+    const bool any = with_type(tile->type, [&](auto value) {
+        const auto* const all = (const decltype(value)*)values;
+        kept = mark_all(task, all, missing, (size_t)count);
+        return kept && survey(task, all);
     });
+    if (!kept) return exactly(task, coded, error);
     if (!any) return constant(task, 0.0, {}, coded, error);
     set_bound(task);
     std::vector<Spec> specs = candidates(task.shape);
@@ -540,13 +576,14 @@ size_t fhash_tile_bound(const fhash_tile* tile) {
 }
 
 int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const void* values,
-                          const fhash_quality* quality, const void* fill, void* stream, size_t room,
-                          size_t* size, fhash_error* error) {
+                          const fhash_quality* quality, const void* missing, int32_t count,
+                          void* stream, size_t room, size_t* size, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         Coded coded;
         if (!context || !size)
             return fail(failed, FHASH_ERROR_ARGUMENT, "a context and a size are needed");
-        if (!encode_quality(*context, tile, values, quality, fill, coded, failed)) return false;
+        if (!encode_quality(*context, tile, values, quality, missing, count, coded, failed))
+            return false;
         *size = coded.data.size();
         if (*size > room || !stream)
             return fail(failed, FHASH_ERROR_SIZE, "the stream has %zu bytes, the room %zu", *size,
@@ -574,8 +611,10 @@ int32_t fhash_tile_code(fhash_context* context, const fhash_tile* tile, const vo
         if (tile->settings) {
             const auto settings = unpack_settings(*context, (const uint8_t*)tile->settings,
                                                   tile->settings_size, failed);
+            Marks marks;
+            mark_not_finite(values, tile->type, vertices(shape), false, marks);
             if (!settings || !encode_tile(*context, settings, shape, tile->type, values,
-                                          in_coreset, *coding, coded, failed))
+                                          in_coreset, marks, *coding, coded, failed))
                 return false;
         } else if (!encode_exact(nullptr, shape, tile->type, values, in_coreset, coded, failed)) {
             return false;

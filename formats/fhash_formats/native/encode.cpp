@@ -9,7 +9,7 @@
 namespace fhash {
 namespace {
 
-constexpr int MAX_LABELS = 65536, MARKS = 4;
+constexpr int MAX_LABELS = 65536;
 constexpr double END_MARGIN = 1e-4;  // share of the range from an end that counts as the end
 constexpr double FEW = 0.03;  // share of values that must be free to change, to be worth the time
 constexpr double MAX_PREDICTED = 1 << 27;
@@ -75,8 +75,9 @@ struct Task {
     int32_t type;
     const uint8_t* values;
     const fhash_coding& coding;
-    Mask finite, counted;
-    Buffer missing;  // section of missing values
+    const Marks& marks;
+    Mask finite, counted;  // finite: not marked
+    Buffer missing;        // section of missing values
 
     int64_t size() const { return vertices(shape); }
     size_t bytes() const { return (size_t)size() * fhash_type_size(type); }
@@ -110,24 +111,13 @@ struct Sections {
     }
 };
 
-// Values with what stands where there is none: unoccupied and missing ones, as a decoder has them.
-template <class O> void finish_as(const Task& task, O* decoded) {
-    const Mask occupied = task.occupied();
-    if (!occupied.empty()) blank(decoded, task.size(), occupied.data(), task.settings.center);
-    if constexpr (is_real<O>) {
-        if (task.missing.empty()) return;
-        const O* const values = (const O*)(const void*)task.values;
-        for (int64_t i = 0; i < task.size(); i++) {
-            const double value = real(values[i]);
-            if (std::isnan(value)) decoded[i] = not_a_number<O>();
-            else if (std::isinf(value)) decoded[i] = values[i];
-        }
-    }
-}
-
+// What a decoder puts where no vertex is occupied.
 void finish(const Task& task, Coded& coded) {
+    const Mask occupied = task.occupied();
+    if (occupied.empty()) return;
     with_type(task.type, [&](auto value) {
-        finish_as(task, (decltype(value)*)(void*)coded.decoded.data());
+        blank((decltype(value)*)(void*)coded.decoded.data(), task.size(), occupied.data(),
+              task.settings.center);
         return true;
     });
 }
@@ -387,23 +377,10 @@ bool encode_transformed(const Task& task, Coded& coded, fhash_error& error) {
     return encode_task_exactly(task, coded, error);
 }
 
-// Where values are finite, which of them count, and the section of those that are missing.
+// Which values are not marked, which of them count, and the section of those that are.
 bool survey(Task& task, const uint8_t* in_coreset, fhash_error& error) {
     const int64_t n = task.size();
-    std::vector<uint16_t> marks;
-    task.typed([&](auto* values) {
-        for (int64_t i = 0; i < n; i++) {
-            const double value = real(values[i]);
-            if (std::isfinite(value)) continue;
-            if (marks.empty()) {
-                marks.assign((size_t)n, 0);
-                task.finite.assign((size_t)n, 1);
-            }
-            task.finite[(size_t)i] = 0;
-            marks[(size_t)i] = std::isnan(value) ? 1 : value > 0 ? 2 : 3;
-        }
-        return true;
-    });
+    for (const uint16_t mark : task.marks.of) task.finite.push_back(mark == 0);
     task.counted = task.finite;
     if (in_coreset) {
         if (task.counted.empty()) task.counted.assign((size_t)n, 1);
@@ -411,8 +388,18 @@ bool survey(Task& task, const uint8_t* in_coreset, fhash_error& error) {
     }
     if (std::find(task.counted.begin(), task.counted.end(), 0) == task.counted.end())
         task.counted.clear();
-    if (marks.empty() || !task.coding.keep_missing) return true;
-    return code_labels(marks, MARKS, task.shape, task.missing, error);
+    if (task.marks.of.empty() || !task.coding.keep_missing) return true;
+    const size_t width = fhash_type_size(task.type);
+    std::vector<uint16_t> labels = task.marks.of;
+    Buffer coded;
+    if (!code_labels(labels, (int64_t)task.marks.values.size() + 1, task.shape, coded, error))
+        return false;
+    task.missing.push_back((uint8_t)task.marks.values.size());
+    for (const uint64_t value : task.marks.values)
+        for (size_t byte = 0; byte < width; byte++)
+            task.missing.push_back((uint8_t)(value >> 8 * byte));
+    task.missing.insert(task.missing.end(), coded.begin(), coded.end());
+    return true;
 }
 
 bool encode_about_origin(Task& task, const uint8_t* in_coreset, Coded& coded, fhash_error& error) {
@@ -576,15 +563,54 @@ bool encode_labelled(const Settings* settings, const Shape& shape, int32_t type,
     }
 }
 
+bool mark_not_finite(const void* values, int32_t type, int64_t n, bool every_nan, Marks& marks) {
+    return with_type(type, [&](auto kind) {
+        using O = decltype(kind);
+        if constexpr (is_real<O>) {
+            const O* const all = (const O*)values;
+            const auto bits = [&](O value) {
+                return bits_of(every_nan || std::isinf(real(value)) ? value : not_a_number<O>());
+            };
+            for (int64_t i = 0; i < n; i++)
+                if (!std::isfinite(real(all[i])) && !mark(bits(all[i]), i, n, marks)) return false;
+        }
+        return true;
+    });
+}
+
+bool mark(uint64_t bits, int64_t vertex, int64_t n, Marks& marks) {
+    const auto at = std::lower_bound(marks.values.begin(), marks.values.end(), bits);
+    const size_t number = (size_t)(at - marks.values.begin());
+    if (at == marks.values.end() || *at != bits) {
+        if (marks.values.size() == MAX_MARKED) return false;
+        marks.values.insert(at, bits);
+        for (uint16_t& other : marks.of) other = (uint16_t)(other + (other > number));
+    }
+    if (marks.of.empty()) marks.of.assign((size_t)n, 0);
+    marks.of[(size_t)vertex] = (uint16_t)(number + 1);
+    return true;
+}
+
 bool encode_tile(fhash_context& context, const std::shared_ptr<const Settings>& settings,
                  const Shape& shape, int32_t type, const void* values, const uint8_t* in_coreset,
-                 const fhash_coding& coding, Coded& coded, fhash_error& error) {
+                 const Marks& marks, const fhash_coding& coding, Coded& coded,
+                 fhash_error& error) {
     const Wide& origin = settings->origin;
     double largest;  // a decoder would refuse the stream
     if (!check_numbers(*settings, origin.zero() ? type : (int32_t)FHASH_INT64, largest, error))
         return false;
-    Task task = {context, *settings, shape, type, (const uint8_t*)values, coding, {}, {}, {}};
-    if (origin.zero()) return encode_about_origin(task, in_coreset, coded, error);
+    Task task = {context, *settings, shape, type, (const uint8_t*)values, coding, marks,
+                 {}, {}, {}};
+    const auto restored = [&] {
+        if (coded.data[4] & MISSING)
+            with_type(type, [&](auto kind) {
+                restore((decltype(kind)*)(void*)coded.decoded.data(), marks);
+                return true;
+            });
+        return true;
+    };
+    if (origin.zero())
+        return encode_about_origin(task, in_coreset, coded, error) && restored();
     if (!has_origin(origin, type))
         return fail(error, FHASH_ERROR_ARGUMENT, "an array of this type has no origin");
     std::vector<int64_t> differences((size_t)vertices(shape));
@@ -594,7 +620,7 @@ bool encode_tile(fhash_context& context, const std::shared_ptr<const Settings>& 
         // The difference is right if its sign is that of the comparison.
         const bool above = type == FHASH_INT64 ? (int64_t)value >= (int64_t)origin.bits
                                                : value >= origin.bits;
-        if (above != (differences[i] >= 0))
+        if (above != (differences[i] >= 0) && (marks.of.empty() || !marks.of[i]))
             return fail(error, FHASH_ERROR_ARGUMENT,
                         "a value is too far from the origin of the settings: the difference must "
                         "be an int64");
@@ -603,7 +629,7 @@ bool encode_tile(fhash_context& context, const std::shared_ptr<const Settings>& 
     task.values = (const uint8_t*)differences.data();
     if (!encode_about_origin(task, in_coreset, coded, error)) return false;
     add_origin((int64_t*)(void*)coded.decoded.data(), vertices(shape), origin, type);
-    return true;
+    return restored();
 }
 
 }  // namespace fhash

@@ -81,10 +81,16 @@ template <class T>
 bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8_t* finite,
                     int density, std::vector<T>& target, fhash_error& error);
 
-// The stream of a tile, with its decoded values.
+// Marks a vertex, one of n, as of the value with these bits; false for too many values.
+bool mark(uint64_t bits, int64_t vertex, int64_t n, Marks& marks);
+// Marks the values that are not finite; false for too many different ones, of which there are three
+// at most unless the bits of every NaN are kept.
+bool mark_not_finite(const void* values, int32_t type, int64_t n, bool every_nan, Marks& marks);
+
+// The stream of a tile, with its decoded values. marks: all values that are not finite, and others.
 bool encode_tile(fhash_context& context, const std::shared_ptr<const Settings>& settings,
                  const Shape& shape, int32_t type, const void* values, const uint8_t* in_coreset,
-                 const fhash_coding& coding, Coded& coded, fhash_error& error);
+                 const Marks& marks, const fhash_coding& coding, Coded& coded, fhash_error& error);
 
 // A tile stored without loss, deflated or as labels. settings: those to put into the stream, or
 // null. occupied: the mask, or null. labelled: false without an error for too many labels.

@@ -111,13 +111,16 @@ typedef struct fhash_quality {
 
 /* Encode a tile, with settings of its own in the stream. tile->settings is NULL.
  *
- * fill: NULL, or the value of the tile's type that stands where a store has none; it takes no part in the range.
+ * missing: NULL, or `count` values of the tile's type, at most 16, that stand where there is none, such as fill values
+ *     of a store. They come back bit by bit, as NaN and infinities do, and take no part in range and bound; so do values
+ *     farther from all others than these are from each other, and planes of zeros, which stores have where nothing was
+ *     written.
  * stream: room of `room` bytes, or NULL.
  * size: gets the bytes of the stream, also where it does not fit (FHASH_ERROR_SIZE); fhash_tile_bound says how many
  *     are enough. */
 FHASH_API int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const void* values,
-                                    const fhash_quality* quality, const void* fill, void* stream, size_t room,
-                                    size_t* size, fhash_error* error);
+                                    const fhash_quality* quality, const void* missing, int32_t count, void* stream,
+                                    size_t room, size_t* size, fhash_error* error);
 
 /* Bytes that are enough for any stream of a tile of this shape and type. */
 FHASH_API size_t fhash_tile_bound(const fhash_tile* tile);

@@ -4,18 +4,20 @@
 // Neither headers nor libraries of HDF5 are needed: its functions are looked up in the library that
 // calls, so that one binary serves every HDF5 from 1.10 on.
 //
-// Client data are unsigned numbers. The user gives the first five, or three; the filter adds those
-// of the dataset when it is made, so that a chunk is decoded by them alone:
+// Client data are unsigned numbers. The user gives the first five, or three, and a pair for each
+// value that stands for a missing one; the filter adds those of the dataset when it is made, so
+// that a chunk is decoded by them alone:
 //     0      1, the version of this list
 //     1, 2   the bound, a float64: its lower 32 bits, its upper ones
 //     3      kind of the bound: 0 max_error, 1 max_error_rel, 2 step (fhash_quality); usually 0
 //     4      effort, 1 to 9; usually 2
+//     from the user: the missing values, float64s, like the bound; in the dataset:
 //     5      fhash_type of the dataset
 //     6      1 where its numbers are big-endian, else 0
 //     7-10   vertices of a chunk along t, z, y, x; of more axes, t has the leading ones
-//     11     1 where the dataset has a fill value, else 0
-//     12, 13 bits of the fill value, the lower 32 first
-//     14     CRC-32C of those before, in little-endian bytes: HDF5 would take values of another
+//     11     missing values: the fill value, if the dataset declares one, and those of the user
+//     12 ... the bits of each, the lower 32 first
+//     last   CRC-32C of those before, in little-endian bytes: HDF5 would take values of another
 //            type, or of fewer bytes than it needs, without a word
 #include <cmath>
 #include <cstdlib>
@@ -24,6 +26,7 @@
 
 #include "core.hpp"
 #include "kernels.hpp"
+#include "numbers.hpp"
 #include "status.hpp"
 
 #if defined(_WIN32)
@@ -34,9 +37,12 @@
 
 namespace {
 
+using namespace fhash;
+
 // Not registered: of the range that is free for private use. FHASH on the keys of a telephone.
 const int FILTER = 34274;
-const unsigned GIVEN = 5, NUMBERS = 15;
+const unsigned GIVEN = 5, MISSING_COUNT = 11, LEAST = 13;  // numbers without missing values
+const unsigned MAX_MISSING = 8;
 const unsigned REVERSE = 0x100;  // flag of HDF5: decode
 const int64_t MOST_VALUES = 1 << 27;
 const fhash_quality EXACT = {0, 0, 0, 2, 0};
@@ -106,6 +112,29 @@ void swap_bytes(uint8_t* values, size_t bytes, size_t each) {
     }
 }
 
+// The number that stands behind `count` ones of a dataset.
+unsigned checksum(const unsigned* numbers, size_t count) {
+    std::vector<uint8_t> bytes;
+    for (size_t i = 0; i < 4 * count; i++)
+        bytes.push_back((uint8_t)(numbers[i / 4] >> 8 * (i % 4)));
+    return (unsigned)fhash_crc32c(bytes.data(), (int64_t)bytes.size(), 0, 0);
+}
+
+// Whether numbers are the whole list of a dataset.
+bool is_complete(const unsigned* numbers, size_t count) {
+    return count >= LEAST && numbers[MISSING_COUNT] <= MAX_MISSING + 1 &&
+           count == LEAST + 2 * numbers[MISSING_COUNT] &&
+           numbers[count - 1] == checksum(numbers, count - 1);
+}
+
+// A float64 by its lower and its upper half.
+double float64_of(const unsigned* halves) {
+    const uint64_t bits = (uint64_t)halves[1] << 32 | halves[0];
+    double number;
+    std::memcpy(&number, &bits, 8);
+    return number;
+}
+
 // The promise in the numbers that the user gave.
 bool read_quality(const unsigned* numbers, size_t count, fhash_quality& quality,
                   fhash_error& error) {
@@ -119,9 +148,7 @@ bool read_quality(const unsigned* numbers, size_t count, fhash_quality& quality,
         return fail(error, FHASH_ERROR_UNSUPPORTED, "version %u of the numbers; 1 is known",
                     numbers[0]);
     }
-    const uint64_t bits = (uint64_t)numbers[2] << 32 | numbers[1];
-    double bound;
-    std::memcpy(&bound, &bits, 8);
+    const double bound = float64_of(numbers + 1);
     const unsigned kind = count > 3 ? numbers[3] : 0, effort = count > 4 ? numbers[4] : 2;
     if (kind > 2 || effort < 1 || effort > 9) {
         return fail(error, FHASH_ERROR_ARGUMENT,
@@ -166,26 +193,67 @@ int32_t known_type(const Hdf5& hdf5, Id type) {
     return ieee ? FHASH_FLOAT16 + log - 1 : 0;
 }
 
-// The number that stands behind those of a dataset.
-unsigned checksum(const unsigned* numbers) {
-    uint8_t bytes[4 * (NUMBERS - 1)];
-    for (size_t i = 0; i < sizeof bytes; i++) bytes[i] = (uint8_t)(numbers[i / 4] >> 8 * (i % 4));
-    return (unsigned)fhash_crc32c(bytes, sizeof bytes, 0, 0);
+// The bits of the missing values of a dataset: its fill value, and those that the user gave.
+bool missing_values(const Hdf5& hdf5, Id properties, Id type, int32_t known,
+                    const std::vector<unsigned>& given, std::vector<uint64_t>& missing,
+                    fhash_error& error) {
+    const size_t size = fhash_type_size(known);
+    uint8_t fill[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    const int user_defined = 2;  // H5D_FILL_VALUE_USER_DEFINED: others are the zeros of HDF5
+    int defined = 0;
+    if (hdf5.call("H5Pfill_value_defined", -1, properties, &defined) >= 0 &&
+        defined == user_defined &&
+        hdf5.call("H5Pget_fill_value", -1, properties, type, (void*)fill) >= 0) {
+        if (hdf5.call("H5Tget_order", 0, type) != 1) swap_bytes(fill, size, size);
+        uint64_t bits = 0;
+        for (size_t i = 0; i < size; i++) bits = bits << 8 | fill[i];
+        missing.push_back(bits);
+    }
+    if (is_complete(given.data(), given.size())) {  // of another dataset, whose numbers are copied
+        for (size_t i = MISSING_COUNT + 1; i + 2 < given.size() && known == (int32_t)given[5]; i += 2)
+            if (const uint64_t bits = (uint64_t)given[i + 1] << 32 | given[i];
+                std::find(missing.begin(), missing.end(), bits) == missing.end())
+                missing.push_back(bits);
+        missing.resize(std::min<size_t>(missing.size(), MAX_MISSING + 1));
+        return true;
+    }
+    for (size_t i = GIVEN; i + 1 < given.size(); i += 2) {
+        const double number = float64_of(given.data() + i);
+        const bool there = with_type(known, [&](auto kind) {
+            const auto value = cast<decltype(kind)>(number);
+            missing.push_back(bits_of(value));
+            return is_real<decltype(kind)> || real(value) == number;
+        });
+        if (!there) {
+            return fail(error, FHASH_ERROR_ARGUMENT,
+                        "the missing value %g is no number of the dataset's type", number);
+        }
+    }
+    return true;
 }
 
 // Adds the numbers of a dataset to those of the user.
-bool complete(const Hdf5& hdf5, Id properties, Id type, unsigned* numbers, unsigned& flags,
-              fhash_error& error) {
-    size_t count = NUMBERS;
+bool complete(const Hdf5& hdf5, Id properties, Id type, std::vector<unsigned>& numbers,
+              unsigned& flags, fhash_error& error) {
+    std::vector<unsigned> given(LEAST + 2 * (MAX_MISSING + 1));
+    size_t count = given.size();
     char name[1];
-    if (hdf5.call("H5Pget_filter_by_id2", -1, properties, FILTER, &flags, &count, numbers,
+    if (hdf5.call("H5Pget_filter_by_id2", -1, properties, FILTER, &flags, &count, given.data(),
                   (size_t)0, name, (unsigned*)nullptr) < 0) {
         return fail(error, FHASH_ERROR_UNSUPPORTED, "this HDF5 does not tell the filter's numbers");
     }
     fhash_quality quality;
-    if (!read_quality(numbers, count, quality, error)) return false;
-    if (count < 4) numbers[3] = 0;
-    numbers[4] = (unsigned)quality.effort;
+    if (!read_quality(given.data(), count, quality, error)) return false;
+    given.resize(std::min(count, given.size()));
+    const bool copied = is_complete(given.data(), given.size());
+    if (!copied && count > GIVEN && (count % 2 == 0 || count > GIVEN + 2 * MAX_MISSING)) {
+        return fail(error, FHASH_ERROR_ARGUMENT,
+                    "%zu numbers are given; 5 are needed, and two for each of at most %u missing "
+                    "values",
+                    count, MAX_MISSING);
+    }
+    given.resize(std::max<size_t>(given.size(), GIVEN));
+    given[4] = (unsigned)quality.effort;
     const int32_t known = known_type(hdf5, type);
     if (!known) {
         return fail(error, FHASH_ERROR_UNSUPPORTED,
@@ -205,21 +273,18 @@ bool complete(const Hdf5& hdf5, Id properties, Id type, unsigned* numbers, unsig
         return fail(error, FHASH_ERROR_UNSUPPORTED,
                     "a chunk has %llu values; at most 2^27 are coded", (unsigned long long)values);
     }
-    const bool big = hdf5.call("H5Tget_order", 0, type) == 1;
-    numbers[5] = (unsigned)known;
-    numbers[6] = big;
-    for (int axis = 0; axis < 4; axis++) numbers[7 + axis] = (unsigned)shape[axis];
-    uint8_t fill[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-    int defined = 0;
-    numbers[11] = hdf5.call("H5Pfill_value_defined", -1, properties, &defined) >= 0 && defined &&
-                  hdf5.call("H5Pget_fill_value", -1, properties, type, (void*)fill) >= 0;
-    const size_t size = fhash_type_size(known);
-    if (!big) swap_bytes(fill, size, size);
-    uint64_t bits = 0;
-    for (size_t i = 0; i < size; i++) bits = bits << 8 | fill[i];
-    numbers[12] = (unsigned)bits;
-    numbers[13] = (unsigned)(bits >> 32);
-    numbers[14] = checksum(numbers);
+    std::vector<uint64_t> missing;
+    if (!missing_values(hdf5, properties, type, known, given, missing, error)) return false;
+    numbers.assign(given.begin(), given.begin() + GIVEN);
+    numbers.push_back((unsigned)known);
+    numbers.push_back(hdf5.call("H5Tget_order", 0, type) == 1);
+    for (const uint64_t length : shape) numbers.push_back((unsigned)length);
+    numbers.push_back((unsigned)missing.size());
+    for (const uint64_t bits : missing) {
+        numbers.push_back((unsigned)bits);
+        numbers.push_back((unsigned)(bits >> 32));
+    }
+    numbers.push_back(checksum(numbers.data(), numbers.size()));
     return true;
 }
 
@@ -234,13 +299,17 @@ bool complete(const Hdf5& hdf5, Id properties, Id type, unsigned* numbers, unsig
 int set_local(Id properties, Id type, Id) {
     const Hdf5 hdf5(FHASH_CALLER);
     fhash_error error;
-    unsigned numbers[NUMBERS] = {0}, flags = 0;
-    if (!complete(hdf5, properties, type, numbers, flags, error)) {
+    std::vector<unsigned> numbers;
+    unsigned flags = 0;
+    const int32_t status = reported(&error, [&](fhash_error& failure) {
+        return complete(hdf5, properties, type, numbers, flags, failure);
+    });
+    if (status != FHASH_OK) {
         hdf5.say(error);
         return -1;
     }
-    return hdf5.call("H5Pmodify_filter", -1, properties, FILTER, flags, (size_t)NUMBERS,
-                     (const unsigned*)numbers);
+    return hdf5.call("H5Pmodify_filter", -1, properties, FILTER, flags, numbers.size(),
+                     (const unsigned*)numbers.data());
 }
 
 // A chunk, and what to make of it.
@@ -252,8 +321,7 @@ struct Chunk {
 };
 
 bool read_chunk(const unsigned* numbers, size_t count, Chunk& chunk, fhash_error& error) {
-    if (count < NUMBERS || numbers[14] != checksum(numbers) ||
-        !fhash_type_size((int32_t)numbers[5])) {
+    if (!is_complete(numbers, count) || !fhash_type_size((int32_t)numbers[5])) {
         return fail(error, FHASH_ERROR_DAMAGED, "the numbers of the dataset are damaged");
     }
     chunk.tile = {};
@@ -323,14 +391,18 @@ size_t encode(const Chunk& chunk, const unsigned* numbers, size_t given, size_t*
         values = std::memcpy(copy.data, *buffer, given);
         swap_bytes((uint8_t*)copy.data, given, chunk.each);
     }
-    const uint64_t bits = (uint64_t)numbers[13] << 32 | numbers[12];
-    uint8_t fill[8];
-    for (size_t i = 0; i < chunk.each; i++) {
-        fill[big_endian_machine() ? chunk.each - 1 - i : i] = (uint8_t)(bits >> 8 * i);
+    const unsigned count = numbers[MISSING_COUNT];
+    std::vector<uint8_t> missing(count * chunk.each + 1);
+    for (unsigned number = 0; number < count; number++) {
+        const unsigned* const halves = numbers + MISSING_COUNT + 1 + 2 * number;
+        const uint64_t bits = (uint64_t)halves[1] << 32 | halves[0];
+        uint8_t* const value = missing.data() + number * chunk.each;
+        for (size_t i = 0; i < chunk.each; i++)
+            value[big_endian_machine() ? chunk.each - 1 - i : i] = (uint8_t)(bits >> 8 * i);
     }
     size_t coded = 0;
-    if (fhash_tile_encode(own.context, &chunk.tile, values, &quality, numbers[11] ? fill : nullptr,
-                          stream.data, room, &coded, &error)) {
+    if (fhash_tile_encode(own.context, &chunk.tile, values, &quality, missing.data(),
+                          (int32_t)count, stream.data, room, &coded, &error)) {
         return 0;
     }
     std::swap(stream.data, *buffer);

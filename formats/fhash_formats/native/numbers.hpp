@@ -17,6 +17,10 @@ struct Half {
 inline double real(Half value) { return (double)from_half(value.bits); }
 template <class T> double real(T value) { return (double)value; }
 
+// What compares as the values do.
+inline float value_of(Half value) { return from_half(value.bits); }
+template <class T> T value_of(T value) { return value; }
+
 template <class T> constexpr bool is_real = std::is_floating_point<T>::value;
 template <> inline constexpr bool is_real<Half> = true;
 
@@ -101,12 +105,25 @@ template <class O> void blank(O* values, int64_t n, const uint8_t* occupied, dou
         if (!occupied[i]) values[i] = nothing;
 }
 
-// Missing values by their marks: 1 NaN, 2 infinity, 3 minus infinity.
-template <class O> void restore(O* values, int64_t n, const uint16_t* marks) {
-    const double infinity = std::numeric_limits<double>::infinity();
-    for (int64_t i = 0; i < n; i++) {
-        if (marks[i] == 1) values[i] = not_a_number<O>();
-        if (marks[i] > 1) values[i] = cast<O>(marks[i] == 2 ? infinity : -infinity);
+// Values that are kept bit by bit beside the coded ones: those that are not finite, and fill values.
+struct Marks {
+    std::vector<uint64_t> values;  // their bits, ascending; at most MAX_MARKED
+    std::vector<uint16_t> of;  // 0, or 1 + the number of its value, of each vertex; empty for none
+};
+constexpr size_t MAX_MARKED = 255;
+
+template <class O> uint64_t bits_of(O value) {
+    typename Word<sizeof(O)>::Of bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+// The marked values in their places.
+template <class O> void restore(O* values, const Marks& marks) {
+    for (size_t i = 0; i < marks.of.size(); i++) {
+        if (!marks.of[i]) continue;
+        const auto bits = (typename Word<sizeof(O)>::Of)marks.values[marks.of[i] - 1u];
+        std::memcpy(values + i, &bits, sizeof bits);
     }
 }
 

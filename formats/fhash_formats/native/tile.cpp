@@ -12,7 +12,7 @@ namespace {
 
 constexpr int64_t MAX_VERTICES = 1 << 27;
 constexpr uint64_t WORK_BYTES = 34;  // of a vertex, beside the caller's arrays
-constexpr int MAX_LABELS = 65536, MARKS = 4;
+constexpr int MAX_LABELS = 65536;
 
 bool cut_short(fhash_error& error) {
     return fail(error, FHASH_ERROR_DAMAGED, "a coded tile is cut short");
@@ -113,21 +113,29 @@ bool decode_labelled(const Job& job, O* values, uint8_t* occupied, fhash_error& 
     return true;
 }
 
-// What all kinds with settings share at last: vertices without a value, missing values.
-template <class O>
-bool finish(const Job& job, O* values, const uint8_t* occupied, fhash_error& error) {
-    if (occupied) blank(values, job.size(), occupied, job.settings->center);
-    const Bytes& missing = job.stream.missing;
-    if (!missing.at || !missing.left()) return true;
-    if constexpr (!is_real<O>) {
-        return fail(error, FHASH_ERROR_DAMAGED, "a coded tile of integers has missing values");
-    } else {
-        std::vector<uint16_t> marks((size_t)job.size());
-        if (!decode_labels(missing.at, missing.left(), MARKS, job.shape, marks.data(), error))
-            return false;
-        restore(values, job.size(), marks.data());
-        return true;
+// Missing values in their places; the last step, after an origin.
+bool restore_missing(const Job& job, void* values, fhash_error& error) {
+    Bytes section = job.stream.missing;
+    if (!section.at || job.lod) return true;
+    Marks marks;
+    const size_t width = fhash_type_size(job.type);
+    const uint8_t *count, *bits;
+    if (!section.take(1, count) || !section.take(*count * width, bits)) return cut_short(error);
+    for (size_t i = 0; i < *count; i++) {
+        uint64_t value = 0;
+        for (size_t byte = width; byte-- > 0;) value = value << 8 | bits[i * width + byte];
+        if (i && value <= marks.values.back())
+            return fail(error, FHASH_ERROR_DAMAGED,
+                        "the missing values of a coded tile do not ascend");
+        marks.values.push_back(value);
     }
+    marks.of.resize((size_t)job.size());
+    if (!decode_labels(section.at, section.left(), *count + 1, job.shape, marks.of.data(), error))
+        return false;
+    return with_type(job.type, [&](auto type) {
+        restore((decltype(type)*)values, marks);
+        return true;
+    });
 }
 
 bool decode_foretold(const Job& job, void* values, uint8_t* occupied, fhash_error& error) {
@@ -268,8 +276,10 @@ bool decode_coded(const Job& job, void* values, uint8_t* occupied, fhash_error& 
     }
     if (!done || job.lod) return done;
     const bool masked = job.stream.mask.at || (kind == EMPTY && job.stream.masked);
+    if (!masked) return true;
     return with_type(job.coded_type(), [&](auto type) {
-        return finish(job, (decltype(type)*)values, masked ? occupied : nullptr, error);
+        blank((decltype(type)*)values, job.size(), occupied, settings.center);
+        return true;
     });
 }
 
@@ -495,7 +505,7 @@ bool decode(const Job& job, void* values, uint8_t* occupied, fhash_error& error)
     if (!decode_about_origin(job, values, occupied, error)) return false;
     if (job.settings && !job.settings->origin.zero())
         add_origin((int64_t*)values, vertices(job.out_shape()), job.settings->origin, job.type);
-    return true;
+    return restore_missing(job, values, error);
 }
 
 template <class T> bool decode_linear(const Job& job, T* values, fhash_error& error) {

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from fhash_formats.transform.tile import (
     DEFAULT_EFFORT,
     Quality,
     check_effort,
+    check_missing,
     decode_chunk,
     encode_chunk,
     supported,
@@ -48,11 +49,13 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
 
     Args:
         max_error: as in `Quality`; exactly one of the three is given.
-        max_error_rel: as in `Quality`. The range leaves out 0, with which Zarr fills.
+        max_error_rel: as in `Quality`.
         step: as in `Quality`.
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             array best.
         effort: as in `encode_chunk`: 1 is the fastest, 9 tries the most.
+        missing: values that stand for missing ones, among them the fill value of the array, which
+            numcodecs does not hand on.
 
     Raises InputError.
     """
@@ -67,9 +70,12 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
         step: float | None = None,
         transform: TransformSpec | Mapping[str, Any] | None = None,
         effort: int = DEFAULT_EFFORT,
+        missing: Sequence[float] = (),
     ) -> None:
         check_effort(effort)
+        check_missing(missing)
         self.effort = effort
+        self.missing = tuple(missing)
         self.quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
         self.transform = (
             TransformSpec.from_dict(transform) if isinstance(transform, Mapping) else transform
@@ -82,6 +88,8 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
             config["transform"] = self.transform.to_dict()
         if self.effort != DEFAULT_EFFORT:
             config["effort"] = self.effort
+        if self.missing:
+            config["missing"] = [np.asarray(value).item() for value in self.missing]
         return config
 
     def encode(self, buf: Any) -> bytes:
@@ -98,7 +106,11 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
             + struct.pack(f"<B{values.ndim}Q", axes, *values.shape)
         )
         data = encode_chunk(
-            values, **self.quality.to_dict(), transform=self.transform, effort=self.effort
+            values,
+            **self.quality.to_dict(),
+            transform=self.transform,
+            effort=self.effort,
+            missing=self.missing,
         )
         return header + zlib.crc32(header).to_bytes(4, "little") + data
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -40,6 +40,9 @@ It is the mean over coefficients of many series, which differ by 3 or less.
 """
 DENSITIES = (1, 2, 4, 8)
 """Thresholds per factor of two with which values may be filled."""
+
+MAX_MISSING = 16
+"""Values that an array may have for missing ones (native/chunk.cpp)."""
 
 _MEMORY = -2
 _DAMAGED = -3
@@ -277,19 +280,20 @@ def encode_tile(
     return _coded(values, settings, coding, in_coreset)
 
 
-def encode_for(tile: Values, quality: tuple[Any, ...], fill: Values | None) -> bytes:
+def encode_for(tile: Values, quality: tuple[Any, ...], missing: Values) -> bytes:
     """The stream of a tile (t, z, y, x), with settings of its own, for a quality.
 
-    quality: the numbers of `fhash_quality` (fhash.h). fill: the store's fill value, or None.
+    quality: the numbers of `fhash_quality` (fhash.h). missing: values that stand for missing ones,
+    of the tile's type.
     """
     *numbers, transform = quality
     t, z, y, x = tile.shape
     of = _tile((t, z, y, x), tile.dtype, None)
     room = np.empty(native.library().fhash_tile_bound(ctypes.byref(of)), np.uint8)
     asked, size = _Quality(*numbers, (ctypes.c_uint8 * 4)(*transform)), ctypes.c_size_t()
-    blank = None if fill is None else _pointer(fill)
     results = (_pointer(room), room.size, ctypes.byref(size))
-    _call("fhash_tile_encode", of, _pointer(tile), ctypes.byref(asked), blank, *results)
+    given = (ctypes.byref(asked), _pointer(missing), missing.size)
+    _call("fhash_tile_encode", of, _pointer(tile), *given, *results)
     return room[: size.value].tobytes()
 
 
@@ -545,17 +549,15 @@ def encode_chunk(
     max_error_rel: float | None = None,
     step: float | None = None,
     transform: TransformSpec | Mapping[str, Any] | None = None,
-    fill: Any = 0,
+    missing: Sequence[Any] = (),
     effort: int = DEFAULT_EFFORT,
 ) -> bytes:
     """The stream of an array.
 
-    NaN and infinities come back where they were and take no part in range or bound. Stores put fill
-    values where nothing was written, and beyond the end of an array. So these take no part in the
-    range of `max_error_rel` either, nor does a value that is the only one of a plane at either end
-    of an axis: a filter may have changed the fill value, and some stores do not tell it. Where
-    parts of a chunk are written one after the other, the same holds for what the bound made of a
-    fill value.
+    NaN, infinities and missing values come back bit by bit, and take no part in range or bound. So
+    do planes of zeros, which stores have where nothing was written, and values that are farther
+    from all others than these are from each other, such as -999 in a file that says only in an
+    attribute what it means.
 
     Args:
         values: array of a type that `supported` accepts; its axes become those of `tile_shape`.
@@ -563,7 +565,8 @@ def encode_chunk(
         max_error_rel: as in `Quality`.
         step: as in `Quality`.
         transform: transform along (t, z, y, x); None for the one that codes best in a trial.
-        fill: the fill value of the store; None where it has none.
+        missing: values that stand for missing ones, at most 16: the fill value of the store, and
+            others such as `missing_value` of CF.
         effort: 1 tries nothing; 2 to 9 try transforms, steps and two quantisers, on ever larger
             parts of the array.
 
@@ -581,8 +584,29 @@ def encode_chunk(
     if share == 0:
         error, share = 0.0, None
     asked = (-1.0 if error is None else error, share or 0.0, quality.step or 0.0)
-    blank = None if fill is None else np.asarray(fill).astype(tile.dtype)
-    return encode_for(tile, (*asked, effort, bool(spec), given), blank) if tile.size else b""
+    named = _missing_values(missing, tile.dtype)
+    return encode_for(tile, (*asked, effort, bool(spec), given), named) if tile.size else b""
+
+
+def check_missing(missing: Any) -> None:
+    """Raises InputError for anything but a list of at most MAX_MISSING numbers."""
+    values = np.array(missing)
+    if values.ndim != 1 or values.dtype.kind not in "iuf" or len(values) > MAX_MISSING:
+        raise InputError(
+            f"missing is {missing!r:.60}; a list of at most {MAX_MISSING} numbers is needed"
+        )
+
+
+def _missing_values(missing: Sequence[Any], dtype: np.dtype[Any]) -> Values:
+    """Values that stand for missing ones, in the type of an array. Raises InputError."""
+    check_missing(missing)
+    cast = np.empty(len(missing), dtype)
+    for number, value in enumerate(missing):
+        with np.errstate(all="ignore"):
+            cast[number] = np.asarray(value).astype(dtype)
+        if dtype.kind in "iu" and cast[number] != value:
+            raise InputError(f"missing has {value!r:.40}, which is no {dtype}")
+    return cast
 
 
 def check_effort(effort: Any) -> None:

@@ -11,9 +11,8 @@
     )
 
 Each chunk is one tile, which has a checksum. Do not compress the chunks again: use
-`compressors=None`. Zarr pads chunks at the border of the array with the fill value, which takes no
-part in the range of `max_error_rel`. NaN is the best fill value, since it takes hardly any bytes;
-beside another one, decoded values may lie between it and the others, within the bound.
+`compressors=None`. The fill value of the array comes back exactly, and takes no part in range and
+bound. So do the values of `missing`: a codec does not see attributes such as `missing_value`.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from fhash_formats.transform.tile import (
     DEFAULT_EFFORT,
     Quality,
     check_effort,
+    check_missing,
     decode_chunk,
     decode_tile,
     encode_chunk,
@@ -66,6 +66,7 @@ class TransformCodec(ArrayBytesCodec):
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             chunk best.
         effort: as in `encode_chunk`: 1 is the fastest, 9 tries the most.
+        missing: values that stand for missing ones beside the array's fill value.
         settings: settings that all chunks share, as in containers.
         reading: whether the codec only decodes streams with their own settings, as in containers
             whose configuration is empty.
@@ -83,6 +84,7 @@ class TransformCodec(ArrayBytesCodec):
     step: float | None = None
     transform: TransformSpec | Mapping[str, Any] | None = None
     effort: int = DEFAULT_EFFORT
+    missing: Sequence[float] = ()
     settings: TileSettings | None = None
     reading: bool = False
     axes: Sequence[str] | None = None
@@ -93,11 +95,14 @@ class TransformCodec(ArrayBytesCodec):
         if self.settings is None and not self.reading:
             Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
             check_effort(self.effort)
+            check_missing(self.missing)
+            object.__setattr__(self, "missing", tuple(self.missing))
             if isinstance(self.transform, Mapping):
                 object.__setattr__(self, "transform", TransformSpec.from_dict(self.transform))
         elif (
             (self.max_error, self.max_error_rel, self.step, self.transform) != (None,) * 4
             or self.effort != DEFAULT_EFFORT
+            or len(self.missing)
             or (self.reading and self.settings)
         ):
             raise InputError(
@@ -117,7 +122,7 @@ class TransformCodec(ArrayBytesCodec):
         if "settings" in configuration or not configuration:
             settings = settings_of(configuration)
             return cls(settings=settings, reading=settings is None, axes=axes)
-        keys = ("max_error", "max_error_rel", "step", "transform", "effort")
+        keys = ("max_error", "max_error_rel", "step", "transform", "effort", "missing")
         unknown = [key for key in configuration if key not in keys]
         if unknown:
             raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(keys)}")
@@ -140,6 +145,8 @@ class TransformCodec(ArrayBytesCodec):
                 configuration["transform"] = self.transform.to_dict()
             if self.effort != DEFAULT_EFFORT:
                 configuration["effort"] = self.effort
+            if self.missing:
+                configuration["missing"] = [np.asarray(value).item() for value in self.missing]
         if self.axes is not None:
             configuration[KEY] = list(self.axes)
         return {"name": NAME, "configuration": configuration}
@@ -199,7 +206,7 @@ class TransformCodec(ArrayBytesCodec):
                 max_error_rel=self.max_error_rel,
                 step=self.step,
                 transform=self.transform,
-                fill=chunk_spec.fill_value,
+                missing=(chunk_spec.fill_value, *self.missing),
                 effort=self.effort,
             )
         else:

@@ -63,7 +63,7 @@ for _name, _result, *_arguments in (
     ("fhash_context_destroy", None, POINTER),
     ("fhash_tile_bound", SIZE, POINTER),
     ("fhash_tile_decode", INT, *(POINTER,) * 3, SIZE, INT, *(POINTER,) * 3),
-    ("fhash_tile_encode", INT, *(POINTER,) * 6, SIZE, *(POINTER,) * 2),
+    ("fhash_tile_encode", INT, *(POINTER,) * 5, INT, POINTER, SIZE, *(POINTER,) * 2),
 ):
     _function = getattr(LIBRARY, _name)
     _function.restype, _function.argtypes = _result, _arguments
@@ -82,8 +82,9 @@ def tile_of(shape: tuple[int, ...], dtype: Any, settings: bytes | None = None) -
 
 
 def encode(context: int | None, values: Values, room: int = 1 << 16, **given: Any) -> Any:
-    """Status, text, size and bytes of a stream; given: fields of the quality, `fill`, `tile`."""
-    tile, fill = given.pop("tile", tile_of(values.shape, values.dtype)), given.pop("fill", None)
+    """Status, text, size and bytes of a stream; given: fields of the quality, `missing`, `tile`."""
+    tile = given.pop("tile", tile_of(values.shape, values.dtype))
+    missing = np.asarray(given.pop("missing", ()), values.dtype)
     quality = Quality(**{"max_error": -1.0, "effort": 2, **given})
     error, size, stream = Error(), SIZE(), ctypes.create_string_buffer(max(room, 1))
     status = LIBRARY.fhash_tile_encode(
@@ -91,7 +92,8 @@ def encode(context: int | None, values: Values, room: int = 1 << 16, **given: An
         ctypes.byref(tile),
         values.ctypes.data,
         ctypes.byref(quality),
-        None if fill is None else fill.ctypes.data,
+        missing.ctypes.data,
+        len(missing),
         stream,
         room,
         ctypes.byref(size),
@@ -194,13 +196,117 @@ def test_masks_and_settings_beside_the_stream(dtype: str, context: int) -> None:
     assert decode(context, data, tile_of(SHAPE, dtype))[0] == STATUS["ERROR_DAMAGED"]
 
 
-def test_a_fill_value_takes_no_part_in_the_range(context: int) -> None:
-    values, fill = field("f4"), np.float32([-1e6])
-    values[:, :, 2] = fill[0]
-    data = encode(context, values, max_error_rel=0.01, fill=fill)[3]
-    found, kept = decode(context, data, tile_of(SHAPE, "f4"))[1], values != fill[0]
-    assert np.abs(found - values)[kept].max() <= 0.01 * np.ptp(values[kept])
-    assert len(encode(context, values, max_error_rel=0.01)[3]) < len(data)
+QUALITIES: tuple[dict[str, float], ...] = (
+    {"max_error": 0.7},
+    {"max_error_rel": 0.01},
+    {"step": 4.0},
+    {"max_error": 0.0},
+)
+
+
+def error_of(found: Values, values: Values) -> float:
+    """The largest error, in Python's numbers."""
+    pairs = zip(found.ravel().tolist(), values.ravel().tolist(), strict=True)
+    return max((abs(one - other) for one, other in pairs), default=0)
+
+
+def limit_of(quality: dict[str, float], values: Values) -> float:
+    """The largest error that a quality allows."""
+    if "max_error_rel" in quality:
+        return quality["max_error_rel"] * (values.max().item() - values.min().item())
+    return quality.get("max_error", np.inf)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("effort", [1, 3])
+def test_missing_values_come_back_bit_by_bit(dtype: str, effort: int, context: int) -> None:
+    """Far from the others and among them, one and two of them, in every form of a stream; the
+    bounds are those of the other values, and the reference reads the same bits."""
+    values = field(dtype)
+    top = np.iinfo(dtype).max if values.dtype.kind in "iu" else np.finfo(dtype).max
+    middle = values.ravel()[40]
+    for missing in ([top], [middle], [top, middle], [top, 0]):
+        gone = np.random.default_rng(1).random(SHAPE) < 0.3
+        named = np.asarray(missing, dtype)
+        given = np.where(gone, np.random.default_rng(2).choice(named, SHAPE), values)
+        kept = ~np.isin(given, named)
+        for quality in QUALITIES:
+            data = encode(context, given, missing=missing, effort=effort, **quality)[3]
+            found = decode(context, data, tile_of(SHAPE, dtype))[1]
+            assert found[~kept].tobytes() == given[~kept].tobytes()
+            assert error_of(found[kept], given[kept]) <= limit_of(quality, given[kept])
+            assert found.tobytes() == decode_tile(data, SHAPE, np.dtype(dtype))[0].tobytes()
+
+
+def test_values_beside_a_missing_one_beyond_any_difference(context: int) -> None:
+    """Differences from an origin near one end of int64 do not reach the other end."""
+    values = (field("i8") + 2**62).astype("i8")
+    values[0, 1] = np.iinfo("i8").min
+    for quality in QUALITIES:
+        data = encode(context, values, missing=[np.iinfo("i8").min], **quality)[3]
+        found = decode(context, data, tile_of(SHAPE, "i8"))[1]
+        assert (found[0, 1] == values[0, 1]).all()
+        kept = values > 0
+        assert error_of(found[kept], values[kept]) <= limit_of(quality, values[kept])
+        assert found.tobytes() == decode_tile(data, SHAPE, np.dtype("i8"))[0].tobytes()
+
+
+@pytest.mark.parametrize("dtype", ["f4", "i2", "f2", "u8"])
+def test_what_a_store_puts_there_is_found_without_being_named(dtype: str, context: int) -> None:
+    """Flags far from all other values at both ends, and zeros in planes that nobody wrote."""
+    values = field(dtype) + np.asarray(20, dtype)
+    flags = {"i2": (-32768, -32767, 32767), "u8": (2**63,)}.get(dtype, (-60000, -59000, 60000))
+    for number, flag in enumerate(flags):
+        values[0, number, 0] = flag
+    values[1], values[:, :, 3] = 0, 0
+    kept = (values != 0) & ~np.isin(values, np.asarray(flags, dtype))
+    for quality in QUALITIES:
+        data = encode(context, values, **quality)[3]
+        found = decode(context, data, tile_of(SHAPE, dtype))[1]
+        assert found[~kept].tobytes() == values[~kept].tobytes()
+        assert error_of(found[kept], values[kept]) <= limit_of(quality, values[kept])
+
+
+def test_rows_are_written_one_after_the_other(context: int) -> None:
+    """A store decodes a chunk, and codes it with new rows: what is not there yet stays, and bounds
+    are those of what is there."""
+    values, fill = field("f4") - 50, np.float32(-999)
+    for missing in ([fill], []):
+        blank = fill if missing else np.float32(0)
+        chunk = np.full(SHAPE, blank)
+        for row in range(SHAPE[2]):
+            chunk[:, :, row] = values[:, :, row]
+            data = encode(context, chunk, missing=missing, max_error_rel=0.01)[3]
+            chunk = decode(context, data, tile_of(SHAPE, "f4"))[1].copy()
+            assert (chunk[:, :, row + 1 :] == blank).all()
+            assert np.abs(chunk - values)[:, :, row].max() <= 0.01 * np.ptp(values[:, :, : row + 1])
+
+
+def test_many_nan_of_different_bits(context: int) -> None:
+    """Every bit is asked for: each NaN keeps its own, also where they are too many to be named."""
+    for count in (3, 400):
+        values = field("f4", (2, 3, 20, 30)).ravel()
+        values[:count] = (np.arange(count, dtype="u4") + 0x7FC00000).view("f4")
+        values = values.reshape(2, 3, 20, 30)
+        data = encode(context, values, max_error=0.0)[3]
+        found = decode(context, data, tile_of(values.shape, "f4"))[1]
+        assert found.tobytes() == values.tobytes()
+
+
+def test_missing_values_that_are_damaged(context: int) -> None:
+    values = field("f4")
+    values[0, 0, 0, 0], values[0, 0, 0, 1] = np.inf, 1e9
+    data = encode(context, values, max_error=0.1)[3]
+    at = data.index(np.float32([1e9, np.inf]).tobytes())
+    assert data[at - 1] == 2
+    for section in (
+        bytes([2]) + np.float32([np.inf, 1e9]).tobytes(),
+        bytes([2]) + np.float32([1e9, 1e9]).tobytes(),
+        bytes([255]) + data[at : at + 8],
+    ):
+        body = data[4 : at - 1] + section + data[at + 8 :]
+        stream = crc32c(body).to_bytes(4, "little") + body
+        assert decode(context, stream, tile_of(SHAPE, "f4"))[0] == STATUS["ERROR_DAMAGED"]
 
 
 def test_arguments_that_are_not_allowed(context: int) -> None:

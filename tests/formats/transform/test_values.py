@@ -382,6 +382,54 @@ def test_padding_leaves_the_relative_bound(
     assert np.abs((parts[...] - values).astype(float)).max() <= 4 * bound
 
 
+@pytest.mark.parametrize("bound", [{"max_error": 0.02}, {"max_error_rel": 0.01}])
+@pytest.mark.parametrize(
+    ("fill", "missing", "declared"),
+    [(0.5, (), 0.5), (0, (), 0), (-999, (), np.nan), (0.5, (0.5,), np.nan), (0.25, (0.5, 0.25), 7)],
+)
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_missing_values_come_back_and_weaken_no_bound(
+    fill: float,
+    missing: tuple[float, ...],
+    declared: float,
+    bound: dict[str, float],
+    zarr_format: Any,
+) -> None:
+    """The fill value, values far from the others, and those that the caller names; numcodecs does
+    not know the fill value."""
+    y, x = np.mgrid[0:20, 0:30]
+    values = (np.sin(x / 7) * np.cos(y / 5)).astype("f4")
+    gone = (np.abs(y - 9) < 4) & (np.abs(x - 12) < 9)
+    values[gone] = fill
+    options: dict[str, Any] = {"serializer": TransformCodec(**bound, missing=missing)}
+    if zarr_format == 2:
+        named = (*missing, declared)
+        options = {"filters": None, "compressors": NumcodecsTransform(**bound, missing=named)}
+    array = zarr.create_array(
+        zarr.storage.MemoryStore(),
+        shape=values.shape,
+        chunks=(12, 30),
+        dtype="f4",
+        fill_value=declared,
+        zarr_format=zarr_format,
+        **{"compressors": None, **options},
+    )
+    array[...] = values
+    found = zarr.open_array(array.store)[...]
+    assert found[gone].tobytes() == values[gone].tobytes()
+    assert np.abs(found - values)[~gone].max() <= 0.02
+
+
+def test_missing_values_that_are_none_are_refused() -> None:
+    for given in (5, "a", [[1]], [None], range(17)):
+        with pytest.raises(InputError, match="a list of at most 16 numbers"):
+            TransformCodec(max_error=1, missing=given)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="a list of at most 16 numbers"):
+            NumcodecsTransform(max_error=1, missing=given)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="has 0.5, which is no int16"):
+        NumcodecsTransform(max_error=1, missing=[0.5]).encode(np.zeros((3, 4), "i2"))
+
+
 @pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr")
 def test_padding_that_a_filter_changed_leaves_the_relative_bound() -> None:
     values = np.random.default_rng(0).normal(5000, 1, (17, 21))
