@@ -121,6 +121,7 @@ class Variable(ctypes.Structure):
     """Facts of a variable: `fhash_variable`."""
 
     _fields_ = (
+        ("size", ctypes.c_size_t),
         ("name", ctypes.c_char_p),
         ("units", ctypes.c_char_p),
         ("attributes", ctypes.c_char_p),
@@ -188,7 +189,7 @@ class File:
             raise OSError(error.text.decode("utf-8", "replace"))
 
     def _variable(self, number: int) -> Variable:
-        variable = Variable()
+        variable = Variable(ctypes.sizeof(Variable))
         self._call("fhash_variable_get", self._file, number, ctypes.byref(variable))
         return variable
 

@@ -11,6 +11,7 @@ void mexFunction(int outputs, mxArray* output[], int inputs, const mxArray* inpu
     fhash_error error = {0};
     fhash_file* file = NULL;
     fhash_variable variable;
+    variable.size = sizeof variable;
     if (inputs != 4 || outputs > 4 || mxGetString(input[0], path, sizeof path)) {
         mexErrMsgIdAndTxt("fhash:usage", "fhash_read(path, number, step, region)");
     }

@@ -16,6 +16,7 @@ int main(int count, char** words) {
     fhash_error error;
     fhash_file* file = NULL;
     fhash_variable variable;
+    variable.size = sizeof variable;
     if (count != 2) return fprintf(stderr, "usage: read_region RUN.fhz\n"), 2;
     fhash_context* context = fhash_context_create(0, 2); /* no limit of memory, two threads */
     check(fhash_open_path(context, words[1], &file, &error), &error);

@@ -20,6 +20,7 @@ int main(int count, char** words) try {
     const std::unique_ptr<fhash_file, decltype(&fhash_close)> file(opened, fhash_close);
 
     fhash_variable variable;
+    variable.size = sizeof variable;
     check(fhash_variable_get(file.get(), 0, &variable, &error));
     const int64_t* const n = variable.shape;
     std::cout << variable.name << " (" << n[0] << ", " << n[1] << ", " << n[2] << ", " << n[3]

@@ -3,6 +3,7 @@ program read_region
     use, intrinsic :: iso_c_binding
     implicit none
     type, bind(c) :: variable_type
+        integer(c_size_t) :: size
         type(c_ptr) :: name, units, attributes
         integer(c_int32_t) :: kind, levels
         integer(c_int64_t) :: shape(4), tile(4), box(6)
@@ -45,6 +46,7 @@ program read_region
     call get_command_argument(1, path)
     context = fhash_context_create(0_c_int64_t, 2_c_int32_t)
     call check(fhash_open_path(context, trim(path)//c_null_char, file, error))
+    variable%size = c_sizeof(variable)
     call check(fhash_variable_get(file, 0_c_int32_t, variable, error))
     print '(a, " (", 3(i0, ", "), i0, ") ", a)', text(variable%name), variable%shape, text(variable%units)
 

@@ -1,13 +1,14 @@
 """The codec `fhash.transform` as a filter of HDF5: for h5py, h5netcdf, and xarray through it.
 
-Importing this module registers the filter with h5py, which is all that reading needs. Other
-programs that load HDF5 find it where `fhash hdf5-plugin-path` says. The documentation shows the
-tools.
+Importing this module registers the filter with h5py, and puts the folder of the plugin into
+HDF5_PLUGIN_PATH, where libraries of HDF5 that are loaded later, as that of netCDF4 is, find it. For
+other programs `fhash hdf5-plugin-path` prints it. The documentation shows the tools.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 import struct
 from collections.abc import Sequence
 from typing import Any
@@ -29,6 +30,12 @@ _VERSION = 1
 """First number of the client data."""
 _KINDS = ("max_error", "max_error_rel", "step")
 """Kinds of a bound, by their number in the client data."""
+_DEFAULT_PATH = (
+    os.path.expandvars("%ALLUSERSPROFILE%/hdf5/lib/plugin")
+    if os.name == "nt"
+    else "/usr/local/hdf5/lib/plugin"
+)
+"""Folder of plugins where HDF5_PLUGIN_PATH is not set (H5PL_DEFAULT_PATH of HDF5)."""
 _MAX_MISSING = 8
 """Missing values beside the fill value (native/hdf5_filter.cpp)."""
 
@@ -84,6 +91,9 @@ def _register() -> None:
     find = native.library().H5PLget_plugin_info
     find.restype, find.argtypes = ctypes.c_void_p, ()
     h5py.h5z.register_filter(find())
+    known = os.environ.get("HDF5_PLUGIN_PATH", _DEFAULT_PATH)
+    if str(native.FOLDER) not in known.split(os.pathsep):
+        os.environ["HDF5_PLUGIN_PATH"] = os.pathsep.join((known, str(native.FOLDER)))
 
 
 _register()

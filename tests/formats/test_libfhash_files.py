@@ -49,6 +49,7 @@ class Facts(ctypes.Structure):
     """The `fhash_variable` of fhash.h."""
 
     _fields_ = (
+        ("size", ctypes.c_size_t),
         *((name, ctypes.c_char_p) for name in ("name", "units", "attributes")),
         *((name, _I) for name in ("type", "levels")),
         ("shape", ctypes.c_int64 * 4),
@@ -135,7 +136,7 @@ class Opened:
         return json.loads(LIBRARY.fhash_header(self._file))
 
     def facts(self) -> list[Facts]:
-        found = [Facts() for _ in range(LIBRARY.fhash_variables(self._file))]
+        found = [Facts(ctypes.sizeof(Facts)) for _ in range(LIBRARY.fhash_variables(self._file))]
         for number, each in enumerate(found):
             call(LIBRARY.fhash_variable_get, self._file, number, ctypes.byref(each))
         return found

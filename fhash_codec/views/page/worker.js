@@ -194,12 +194,14 @@ function parsed(at) {
 
 /** Facts about a variable: fhash_variable of fhash.h, whose places are those of wasm32. */
 function variable(number) {
-  return within([176], (at) => {
+  const size = 176;
+  return within([size], (at) => {
+    view().setUint32(at, size, true);
     call("fhash_variable_get", file, number, at);
     const now = view(), double = (place) => now.getFloat64(at + place, true);
     return {
-      name: text(now.getUint32(at, true)), units: text(now.getUint32(at + 4, true)), attributes: parsed(now.getUint32(at + 8, true)),
-      type: now.getInt32(at + 12, true), levels: now.getInt32(at + 16, true), shape: numbers(at + 24, 4), tile: numbers(at + 56, 4),
+      name: text(now.getUint32(at + 4, true)), units: text(now.getUint32(at + 8, true)), attributes: parsed(now.getUint32(at + 12, true)),
+      type: now.getInt32(at + 16, true), levels: now.getInt32(at + 20, true), shape: numbers(at + 24, 4), tile: numbers(at + 56, 4),
       box: numbers(at + 88, 6), low: double(136), high: double(144), background: double(152), maxError: double(160), psnr: double(168),
     };
   });

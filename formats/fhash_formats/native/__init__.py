@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 17
+ABI_VERSION = 18
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -89,6 +89,21 @@ _LOCK = ForkLock()
 _LOADED: dict[tuple[Path, str, int], ctypes.CDLL] = {}
 
 
+class _Library(ctypes.CDLL):
+    """A library; functions that libfhash does not export are found by `fhash_function`."""
+
+    def __getitem__(self, name: Any) -> Any:
+        try:
+            return super().__getitem__(name)
+        except AttributeError:
+            find = super().__getitem__("fhash_function")
+            find.restype, find.argtypes = ctypes.c_void_p, (ctypes.c_char_p,)
+            address = find(name.encode("ascii"))
+            if address is None:
+                raise
+            return self._FuncPtr(address)
+
+
 def library() -> ctypes.CDLL:
     """The native library of this package; see `load_library`."""
     return load_library(FOLDER, "libfhash", ABI_VERSION, PROTOTYPES)
@@ -136,7 +151,7 @@ def load_library(
 
 def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: str) -> ctypes.CDLL:
     try:
-        loaded = ctypes.CDLL(str(path))
+        loaded = _Library(str(path))
         _declare(loaded, version_symbol, ())
         built = getattr(loaded, version_symbol)()
         if built != abi_version:

@@ -117,7 +117,7 @@ FHASH_CRC_TARGET uint32_t by_instruction(const uint8_t* in, int64_t n, uint32_t 
 
 // The CRC-32C of n bytes, continued from `crc`, that of the bytes before them; 0 at the beginning.
 // plain: whether the tables are used where the processor has an instruction, too.
-FHASH_EXPORT int64_t fhash_crc32c(const void* in, int64_t n, int64_t crc, int64_t plain) {
+FHASH_KERNEL int64_t fhash_crc32c(const void* in, int64_t n, int64_t crc, int64_t plain) {
     const uint8_t* bytes = static_cast<const uint8_t*>(in);
     const uint32_t begin = ~(uint32_t)crc;
 #if defined(FHASH_CRC_TARGET)

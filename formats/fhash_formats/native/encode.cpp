@@ -3,6 +3,7 @@
 
 #include "inflate.hpp"
 #include "kernels.hpp"
+#include "memory.hpp"
 #include "numbers.hpp"
 #include "priors.hpp"
 
@@ -134,7 +135,7 @@ bool encode_empty(const Task& task, Coded& coded) {
     Sections sections(EMPTY, task.own(), masked);
     if (!task.missing.empty()) sections.add(MISSING, task.missing);
     coded.data = sealed(sections.flags, sections.all);
-    coded.decoded.resize(task.bytes());
+    make_room(coded.decoded, task.bytes());
     with_type(task.type, [&](auto value) {
         using O = decltype(value);
         std::fill_n((O*)(void*)coded.decoded.data(), task.size(), cast<O>(task.settings.center));
@@ -187,7 +188,7 @@ bool encode_foretold(const Task& task, Coded& coded, fhash_error& error) {
     if (!encode_predicted(predictor, task.shape, task.counts(), integers, body, error))
         return false;
     const std::vector<double> linear = foretold_values(settings, integers);
-    coded.decoded.resize(task.bytes());
+    make_room(coded.decoded, task.bytes());
     correct_within(settings, task.type, linear.data(), {}, task.size(), coded.decoded.data());
     if (!keeps_bound(task, coded)) return encode_task_exactly(task, coded, error);
     Sections sections(PREDICTED, task.own(), settings.mask != nullptr);
@@ -211,7 +212,7 @@ template <class T>
 bool make_target(const Task& task, const Search<T>& search, std::vector<T>& target,
                  fhash_error& error) {
     const Settings& settings = task.settings;
-    target.resize((size_t)task.size());
+    make_room(target, (size_t)task.size());
     task.typed([&](auto* values) {
         for (int64_t i = 0; i < task.size(); i++) {
             const bool there = task.finite.empty() || task.finite[(size_t)i];
@@ -254,7 +255,7 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
     const double low = settings.low - settings.center + margin;
     const double high = settings.high - settings.center - margin;
     const int64_t n = task.size();
-    coefficients.resize((size_t)n);
+    make_room(coefficients, (size_t)n);
     const auto transform = [&] {
         return kernel_done(search.forward->transform(target.data(), coefficients.data()),
                            "a transform", error);
@@ -271,9 +272,13 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
         shifts[i] = (coding.rough ? PLAIN_OFFSETS[i] : settings.offsets[i]) / OFFSET_UNIT;
     const double share = coding.rough && settings.trellis ? TRELLIS_SHARE : 1.0;
     const double step = settings.step / share;
-    std::vector<int32_t> integers((size_t)n);
-    std::vector<T> rebuilt((size_t)n), dequantised((size_t)n);
-    std::vector<float> scaled((size_t)n);
+    std::vector<int32_t> integers;
+    std::vector<T> rebuilt, dequantised;
+    std::vector<float> scaled;
+    make_room(integers, (size_t)n);
+    make_room(rebuilt, (size_t)n);
+    make_room(dequantised, (size_t)n);
+    make_room(scaled, (size_t)n);
     for (int round = 0; round < coding.rounds && (double)free > few; round++) {
         if (coding.rough) {
             quantise(coefficients.data(), n, 1.0 / step, ROUNDING, LARGEST, integers.data(),
@@ -299,7 +304,7 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
 template <class T>
 bool make_residual(const Task& task, const T* base, std::vector<int32_t>& residual) {
     const int64_t n = task.size();
-    residual.assign((size_t)n, 0);
+    make_room(residual, (size_t)n);
     int64_t nonzero = 0;
     task.typed([&](auto* values) {
         using V = std::remove_cv_t<std::remove_pointer_t<decltype(values)>>;
@@ -350,7 +355,7 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     }
     const bool bound = task.coding.error >= 0;
     if (bound && !make_residual(task, linear.data(), residual)) return false;
-    coded.decoded.resize(task.bytes());
+    make_room(coded.decoded, task.bytes());
     correct_within(settings, task.type, linear.data(), residual, task.size(),
                    coded.decoded.data());
     if (bound && !keeps_bound(task, coded)) return false;

@@ -169,7 +169,9 @@ FHASH_API void fhash_close(fhash_file* file);
  * lives as long as the file. */
 FHASH_API const char* fhash_header(const fhash_file* file);
 
+/* Facts about a variable; later versions add some at the end. */
 typedef struct fhash_variable {
+    size_t size;            /* sizeof(fhash_variable), set by the caller: no more bytes are written */
     const char* name;       /* texts live as long as the file */
     const char* units;      /* "" where unknown */
     const char* attributes; /* JSON object: those of the variable */
@@ -186,7 +188,7 @@ typedef struct fhash_variable {
 
 /* Number of variables. */
 FHASH_API int32_t fhash_variables(const fhash_file* file);
-/* Facts about variable number `number`, from 0. */
+/* Facts about variable number `number`, from 0; variable->size = sizeof(fhash_variable) comes first. */
 FHASH_API int32_t fhash_variable_get(const fhash_file* file, int32_t number, fhash_variable* variable,
                                      fhash_error* error);
 

@@ -80,14 +80,17 @@ class Hdf5 {
         return function ? function(arguments...) : missing;
     }
 
-    // Puts an error onto HDF5's stack, which tools print.
+    // Puts an error onto HDF5's stack, which tools print; onto stderr where HDF5 is out of reach.
     void say(const fhash_error& error) const {
         const auto push = (int (*)(Id, const char*, const char*, unsigned, Id, Id, Id, const char*,
                                    ...))find("H5Epush2");
         const auto* cls = (const Id*)find("H5E_ERR_CLS_g");
         const auto* major = (const Id*)find("H5E_PLINE_g");
         const auto* minor = (const Id*)find("H5E_CANTFILTER_g");
-        if (!push || !cls || !major || !minor) return;
+        if (!push || !cls || !major || !minor) {
+            std::fprintf(stderr, "fhash: %s\n", error.text);
+            return;
+        }
         push(0, "hdf5_filter.cpp", "fhash", 1, *cls, *major, *minor, "fhash: %s", error.text);
     }
 
@@ -210,10 +213,12 @@ bool missing_values(const Hdf5& hdf5, Id properties, Id type, int32_t known,
         missing.push_back(bits);
     }
     if (is_complete(given.data(), given.size())) {  // of another dataset, whose numbers are copied
-        for (size_t i = MISSING_COUNT + 1; i + 2 < given.size() && known == (int32_t)given[5]; i += 2)
-            if (const uint64_t bits = (uint64_t)given[i + 1] << 32 | given[i];
-                std::find(missing.begin(), missing.end(), bits) == missing.end())
+        const size_t end = known == (int32_t)given[5] ? given.size() - 1 : 0;
+        for (size_t i = MISSING_COUNT + 1; i < end; i += 2) {
+            const uint64_t bits = (uint64_t)given[i + 1] << 32 | given[i];
+            if (std::find(missing.begin(), missing.end(), bits) == missing.end())
                 missing.push_back(bits);
+        }
         missing.resize(std::min<size_t>(missing.size(), MAX_MISSING + 1));
         return true;
     }
@@ -235,6 +240,11 @@ bool missing_values(const Hdf5& hdf5, Id properties, Id type, int32_t known,
 // Adds the numbers of a dataset to those of the user.
 bool complete(const Hdf5& hdf5, Id properties, Id type, std::vector<unsigned>& numbers,
               unsigned& flags, fhash_error& error) {
+    if (!hdf5.find("H5Pmodify_filter")) {
+        return fail(error, FHASH_ERROR_UNSUPPORTED,
+                    "this program has HDF5 linked into it, and hides its functions from the "
+                    "filter: link HDF5's shared library (h5cc -shlib), or with -rdynamic");
+    }
     std::vector<unsigned> given(LEAST + 2 * (MAX_MISSING + 1));
     size_t count = given.size();
     char name[1];

@@ -216,7 +216,7 @@ inline std::int64_t apply_cross(Frames& frames, const Kernels& kernels, const St
 //
 // Returns 0, or -1 for arguments out of range and lanes that this machine lacks, or -2 where memory
 // ran out.
-FHASH_EXPORT std::int64_t fhash_head_apply(const float* decoded, const std::int64_t* shape,
+FHASH_KERNEL std::int64_t fhash_head_apply(const float* decoded, const std::int64_t* shape,
                                            std::int64_t first, std::int64_t last,
                                            std::int64_t layers, const std::int64_t* widths,
                                            const float* weights, const float* biases,

@@ -67,25 +67,25 @@ i64 reconstruct(const std::int32_t* in, T* out, const i64* shape, const i64* kin
 // in, out: C-ordered arrays of `shape` that do not overlap. kinds: 0 none, 1 Haar, 2 5/3, 3 9/7,
 // 4 KLT. tz (t, z), yx (y, x): the factors of the norms, or of their reciprocals. Returns 0, or -1
 // for an argument out of range, or -2 where memory ran out.
-FHASH_EXPORT i64 fhash_transform_forward_f32(const float* in, float* out, const i64* shape,
+FHASH_KERNEL i64 fhash_transform_forward_f32(const float* in, float* out, const i64* shape,
                                              const i64* kinds, const i64* depths, const i64* ranks,
                                              const float* const* matrices, const float* tz,
                                              const float* yx) {
     return transform<float>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, false);
 }
-FHASH_EXPORT i64 fhash_transform_inverse_f32(const float* in, float* out, const i64* shape,
+FHASH_KERNEL i64 fhash_transform_inverse_f32(const float* in, float* out, const i64* shape,
                                              const i64* kinds, const i64* depths, const i64* ranks,
                                              const float* const* matrices, const float* tz,
                                              const float* yx) {
     return transform<float>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, true);
 }
-FHASH_EXPORT i64 fhash_transform_forward_f64(const double* in, double* out, const i64* shape,
+FHASH_KERNEL i64 fhash_transform_forward_f64(const double* in, double* out, const i64* shape,
                                              const i64* kinds, const i64* depths, const i64* ranks,
                                              const double* const* matrices, const double* tz,
                                              const double* yx) {
     return transform<double>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, false);
 }
-FHASH_EXPORT i64 fhash_transform_inverse_f64(const double* in, double* out, const i64* shape,
+FHASH_KERNEL i64 fhash_transform_inverse_f64(const double* in, double* out, const i64* shape,
                                              const i64* kinds, const i64* depths, const i64* ranks,
                                              const double* const* matrices, const double* tz,
                                              const double* yx) {
@@ -101,13 +101,13 @@ FHASH_EXPORT i64 fhash_transform_inverse_f64(const double* in, double* out, cons
 // steps), center (not -0), low, high.
 //
 // The other arguments and the result are those of the inverse transform.
-FHASH_EXPORT i64 fhash_reconstruct_f32(const std::int32_t* in, float* out, const i64* shape,
+FHASH_KERNEL i64 fhash_reconstruct_f32(const std::int32_t* in, float* out, const i64* shape,
                                        const i64* kinds, const i64* depths, const i64* ranks,
                                        const float* const* matrices, const float* tz,
                                        const float* yx, const double* numbers) {
     return reconstruct<float>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers);
 }
-FHASH_EXPORT i64 fhash_reconstruct_f64(const std::int32_t* in, double* out, const i64* shape,
+FHASH_KERNEL i64 fhash_reconstruct_f64(const std::int32_t* in, double* out, const i64* shape,
                                        const i64* kinds, const i64* depths, const i64* ranks,
                                        const double* const* matrices, const double* tz,
                                        const double* yx, const double* numbers) {

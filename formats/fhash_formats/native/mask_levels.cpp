@@ -124,13 +124,13 @@ FHASH_CLONES int64_t levels_f64(const double* values, const int64_t* shape, cons
 // reach: 0 to 64.
 //
 // Returns 0 or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_mask_levels_f32(const float* values, const int64_t* shape,
+FHASH_KERNEL int64_t fhash_mask_levels_f32(const float* values, const int64_t* shape,
                                            const float* edges, int64_t edge_count,
                                            const int32_t* scores, const int32_t* others,
                                            int64_t reach, uint8_t* first, uint8_t* second) {
     return levels_f32(values, shape, edges, edge_count, scores, others, reach, first, second);
 }
-FHASH_EXPORT int64_t fhash_mask_levels_f64(const double* values, const int64_t* shape,
+FHASH_KERNEL int64_t fhash_mask_levels_f64(const double* values, const int64_t* shape,
                                            const double* edges, int64_t edge_count,
                                            const int32_t* scores, const int32_t* others,
                                            int64_t reach, uint8_t* first, uint8_t* second) {

@@ -105,7 +105,7 @@ template <class O> void blank(O* values, int64_t n, const uint8_t* occupied, dou
         if (!occupied[i]) values[i] = nothing;
 }
 
-// Values that are kept bit by bit beside the coded ones: those that are not finite, and fill values.
+// Values that are kept bit by bit beside the coded ones: not finite ones, and fill values.
 struct Marks {
     std::vector<uint64_t> values;  // their bits, ascending; at most MAX_MARKED
     std::vector<uint16_t> of;  // 0, or 1 + the number of its value, of each vertex; empty for none

@@ -112,7 +112,7 @@ bool forward(fhash_context& context, const Settings& settings, const Shape& shap
 using namespace fhash;
 
 // Fill values of a tile in the working type, where it is not counted, in place (fill_uncounted).
-FHASH_EXPORT int32_t fhash_tile_fill(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_fill(fhash_context* context, const fhash_tile* tile,
                                      const uint8_t* counted, const uint8_t* finite,
                                      int32_t density, void* values, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -126,7 +126,7 @@ FHASH_EXPORT int32_t fhash_tile_fill(fhash_context* context, const fhash_tile* t
 }
 
 // Coefficients of a tile in the working type, low bands first.
-FHASH_EXPORT int32_t fhash_tile_forward(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_forward(fhash_context* context, const fhash_tile* tile,
                                         const void* values, void* out, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
@@ -140,7 +140,7 @@ FHASH_EXPORT int32_t fhash_tile_forward(fhash_context* context, const fhash_tile
 
 // The bytes that the fast coder would take for coefficients, and the sum of squared errors in
 // squared steps: results. scale: 1 / quantiser step. weight: squared steps that a bit is worth.
-FHASH_EXPORT int32_t fhash_tile_foretell(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_foretell(fhash_context* context, const fhash_tile* tile,
                                          const float* coefficients, double scale, double weight,
                                          double* results, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -162,7 +162,7 @@ FHASH_EXPORT int32_t fhash_tile_foretell(fhash_context* context, const fhash_til
 //
 // values: room for float64 numbers. wide: gets whether they are float64; else they are float32.
 // origin: gets the origin's bits, and whether it is negative.
-FHASH_EXPORT int32_t fhash_tile_table(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_table(fhash_context* context, const fhash_tile* tile,
                                       const void* stream, size_t size, int32_t lod, void* values,
                                       int32_t* wide, uint64_t* origin, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -180,7 +180,7 @@ FHASH_EXPORT int32_t fhash_tile_table(fhash_context* context, const fhash_tile* 
 //
 // part: first and last vertex along t, z, y, x. values: room for float32 numbers of the tile.
 // done: gets whether there are such values; else the tile is as well decoded whole.
-FHASH_EXPORT int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
                                             const void* stream, size_t size, const int64_t* part,
                                             float* values, int32_t* done, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -206,7 +206,7 @@ FHASH_EXPORT int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_
 // A part of the values of a tile, as fhash_tile_decode gives them.
 //
 // table: what fhash_tile_uncorrected gave. values: room for the part, in the type of the tile.
-FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
                                      const float* table, const int64_t* part, void* values,
                                      fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -240,7 +240,7 @@ FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* t
 }
 
 // The bytes that coded integers of a tile take by its predictor. counted: null for all.
-FHASH_EXPORT int32_t fhash_tile_foretold(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_foretold(fhash_context* context, const fhash_tile* tile,
                                          const int32_t* integers, const uint8_t* counted,
                                          int64_t* size, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -258,7 +258,7 @@ FHASH_EXPORT int32_t fhash_tile_foretold(fhash_context* context, const fhash_til
 }
 
 // A block of integers that stands alone; as the kernels, which return sizes and errors.
-FHASH_EXPORT int64_t fhash_encode_block(const int32_t* integers, const int64_t* shape,
+FHASH_KERNEL int64_t fhash_encode_block(const int32_t* integers, const int64_t* shape,
                                         uint8_t* data, int64_t capacity) {
     fhash_error error;
     Shape of;
@@ -270,7 +270,7 @@ FHASH_EXPORT int64_t fhash_encode_block(const int32_t* integers, const int64_t* 
     return (int64_t)out.size();
 }
 
-FHASH_EXPORT int64_t fhash_decode_block(const uint8_t* data, int64_t size, const int64_t* shape,
+FHASH_KERNEL int64_t fhash_decode_block(const uint8_t* data, int64_t size, const int64_t* shape,
                                         int32_t* integers) {
     fhash_error error;
     Shape of;

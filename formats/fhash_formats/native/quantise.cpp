@@ -52,24 +52,24 @@ FHASH_CLONED(double)
 
 }  // namespace
 
-FHASH_EXPORT std::int64_t fhash_quantise_f32(const float* in, std::int64_t n, double scale,
+FHASH_KERNEL std::int64_t fhash_quantise_f32(const float* in, std::int64_t n, double scale,
                                              double rounding, double largest, std::int32_t* out,
                                              float* scaled) {
     quantise_cloned(in, n, (float)scale, (float)rounding, (float)largest, out, scaled);
     return 0;
 }
-FHASH_EXPORT std::int64_t fhash_quantise_f64(const double* in, std::int64_t n, double scale,
+FHASH_KERNEL std::int64_t fhash_quantise_f64(const double* in, std::int64_t n, double scale,
                                              double rounding, double largest, std::int32_t* out,
                                              float* scaled) {
     quantise_cloned(in, n, scale, rounding, largest, out, scaled);
     return 0;
 }
-FHASH_EXPORT std::int64_t fhash_dequantise_f32(const std::int32_t* in, std::int64_t n, double step,
+FHASH_KERNEL std::int64_t fhash_dequantise_f32(const std::int32_t* in, std::int64_t n, double step,
                                                const double* shifts, float* out) {
     dequantise_cloned(in, n, (float)step, shifts, out);
     return 0;
 }
-FHASH_EXPORT std::int64_t fhash_dequantise_f64(const std::int32_t* in, std::int64_t n, double step,
+FHASH_KERNEL std::int64_t fhash_dequantise_f64(const std::int32_t* in, std::int64_t n, double step,
                                                const double* shifts, double* out) {
     dequantise_cloned(in, n, step, shifts, out);
     return 0;

@@ -52,12 +52,12 @@
 #define FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS)                                      \
     std::int64_t NAME##_v3 PARAMETERS;                                                      \
     static std::int64_t NAME##_v1 PARAMETERS;                                               \
-    FHASH_EXPORT std::int64_t NAME PARAMETERS {                                             \
+    FHASH_KERNEL std::int64_t NAME PARAMETERS {                                             \
         return (fhash_instructions() & FHASH_HAS_V3 ? NAME##_v3 : NAME##_v1) ARGUMENTS;     \
     }                                                                                       \
     static std::int64_t NAME##_v1 PARAMETERS
 #else
-#define FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS) FHASH_EXPORT std::int64_t NAME PARAMETERS
+#define FHASH_FOR_TARGETS(NAME, PARAMETERS, ARGUMENTS) FHASH_KERNEL std::int64_t NAME PARAMETERS
 #endif
 
 #if !FHASH_TARGET

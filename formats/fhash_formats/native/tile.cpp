@@ -5,6 +5,7 @@
 
 #include "inflate.hpp"
 #include "kernels.hpp"
+#include "memory.hpp"
 #include "numbers.hpp"
 
 namespace fhash {
@@ -227,16 +228,19 @@ bool decode_transformed(const Job& job, void* values, uint8_t* occupied, double 
     const auto plan = plan_for<T>(job.context, settings, job.shape, job.lod, error);
     if (!plan) return false;
     const int64_t n = job.size(), count = vertices(job.out_shape());
-    std::vector<int32_t> residual((size_t)(job.stream.residual.at && !job.lod ? n : 0));
+    std::vector<int32_t> residual;
+    make_room(residual, (size_t)(job.stream.residual.at && !job.lod ? n : 0));
     // Where the sizes are the same, integers, values before the head, and values share the room.
     constexpr bool narrow = std::is_same<T, float>::value;
     const int32_t type = job.coded_type();
     const bool direct = narrow && type == FHASH_FLOAT32 && !job.lod;
-    std::vector<int32_t> integers((size_t)(direct ? 0 : n));
+    std::vector<int32_t> integers;
+    make_room(integers, (size_t)(direct ? 0 : n));
     int32_t* const coefficients = direct ? (int32_t*)values : integers.data();
     if (!read_integers(job, plan->table, coefficients, residual, error)) return false;
     const bool over = narrow && !job.lod;
-    std::vector<T> room((size_t)(over ? 0 : count)), corrected;
+    std::vector<T> room, corrected;
+    make_room(room, (size_t)(over ? 0 : count));
     T* linear = over ? (T*)(void*)coefficients : room.data();
     if (!linear_values(settings, *plan, coefficients, linear, error)) return false;
     if (job.lod) {

@@ -119,16 +119,16 @@ FHASH_INLINE int64_t freed(T* target, const T* rebuilt, const uint8_t* counted, 
                        : freed<T, true>(target, rebuilt, counted, n, low, high); \
     } \
     } \
-    FHASH_EXPORT int64_t fhash_within_##NAME(const T* values, const T* decoded, \
+    FHASH_KERNEL int64_t fhash_within_##NAME(const T* values, const T* decoded, \
                                              const uint8_t* counted, int64_t n, double error) { \
         return within_##NAME(values, decoded, counted, n, error); \
     } \
-    FHASH_EXPORT int64_t fhash_clip_##NAME(T* values, int64_t n, double center, double low, \
+    FHASH_KERNEL int64_t fhash_clip_##NAME(T* values, int64_t n, double center, double low, \
                                            double high) { \
         clipped_##NAME(values, n, (T)center, (T)low, (T)high); \
         return 0; \
     } \
-    FHASH_EXPORT int64_t fhash_free_##NAME(T* target, const T* rebuilt, const uint8_t* counted, \
+    FHASH_KERNEL int64_t fhash_free_##NAME(T* target, const T* rebuilt, const uint8_t* counted, \
                                            int64_t n, double low, double high) { \
         return freed_##NAME(target, rebuilt, counted, n, (T)low, (T)high); \
     }
@@ -147,12 +147,12 @@ FHASH_INLINE int64_t freed(T* target, const T* rebuilt, const uint8_t* counted, 
         corrected<A, B>(base, residual, n, quantum, out); \
     } \
     } \
-    FHASH_EXPORT int64_t fhash_residual_##NAME(const A* values, const B* base, \
+    FHASH_KERNEL int64_t fhash_residual_##NAME(const A* values, const B* base, \
                                                const uint8_t* counted, int64_t n, double quantum, \
                                                double largest, int32_t* out) { \
         return residual_##NAME(values, base, counted, n, quantum, largest, out); \
     } \
-    FHASH_EXPORT int64_t fhash_correct_##NAME(const A* base, const int32_t* residual, int64_t n, \
+    FHASH_KERNEL int64_t fhash_correct_##NAME(const A* base, const int32_t* residual, int64_t n, \
                                               double quantum, B* out) { \
         corrected_##NAME(base, residual, n, quantum, out); \
         return 0; \

@@ -47,8 +47,9 @@ for (const run of runs) {
   call(library.fhash_open_page(context, 0, data.length, place, error));
   const file = view().getUint32(place, true);
   for (let number = 0; number < library.fhash_variables(file); number++) {
+    view().setUint32(place, 176, true);
     call(library.fhash_variable_get(file, number, place, error));
-    const levels = view().getInt32(place + 16, true), shape = [0, 1, 2, 3].map((n) => Number(view().getBigInt64(place + 24 + 8 * n, true)));
+    const levels = view().getInt32(place + 20, true), shape = [0, 1, 2, 3].map((n) => Number(view().getBigInt64(place + 24 + 8 * n, true)));
     for (const step of new Set([0, shape[0] - 1, (shape[0] - 1) / 2])) {
       for (const lod of new Set([0, Math.min(levels, 1)])) each.push([number, step, lod, digest(file, number, step, lod, shape)]);
     }

@@ -62,7 +62,7 @@ LISTS = re.compile(r"#define (FHASH_\w+) +\\\n((?:.*\\\n)*.*)\n")
 
 
 def test_the_prototypes_take_as_many_arguments_as_the_sources() -> None:
-    exported = re.compile(r"FHASH_EXPORT \S+ (fhash_\w+)\(([^)]*)\)")
+    exported = re.compile(r"FHASH_(?:EXPORT|KERNEL) \S+ (fhash_\w+)\(([^)]*)\)")
     checked, known = 0, {**PROTOTYPES, **kernels.PROTOTYPES}
     for source in SOURCES.glob("*.cpp"):
         text = source.read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ __all__ = ["CALL", "exported", "header"]
 CALL = re.compile(r"\bfhash_\w+")
 """Names of functions in the text of a target."""
 
-_EXPORTED = re.compile(r"FHASH_EXPORT\s+(\S+)\s+(fhash_\w+)\(([^)]*)\)")
+_EXPORTED = re.compile(r"FHASH_(?:EXPORT|KERNEL)\s+(\S+)\s+(fhash_\w+)\(([^)]*)\)")
 _FOR_TARGETS = re.compile(r"^FHASH_FOR_TARGETS\((fhash_\w+),\s*\(([^)]*)\)", re.MULTILINE)
 _MACRO = re.compile(r"^#define (\w+)(?:\(([^)]*)\))?[ \t]+(\S.*)$", re.MULTILINE)
 
@@ -47,11 +47,11 @@ def _functions(sources: Iterable[Path]) -> Iterator[tuple[str, ...]]:
 def _expanded(text: str) -> str:
     """Return a source without comments, in which its own macros around exports are expanded."""
     text = re.sub(r"//.*", "", text).replace("\\\n", " ")
-    text = _FOR_TARGETS.sub(r"FHASH_EXPORT int64_t \1(\2)", text)  # target.hpp
+    text = _FOR_TARGETS.sub(r"FHASH_KERNEL int64_t \1(\2)", text)  # target.hpp
     macros = _MACRO.findall(text)
     text = _MACRO.sub("", text)
     for name, given, body in macros:
-        if given and "FHASH_EXPORT" in body:
+        if given and ("FHASH_EXPORT" in body or "FHASH_KERNEL" in body):
             call = re.compile(rf"^{name}\(([^)]*)\)", re.MULTILINE)
             text = call.sub(lambda at, of=given, to=body: _filled(to, of, at[1]), text)
     for name, given, body in macros:

@@ -47,6 +47,7 @@ void mend(Bytes& file) {
 
 void look(fhash_file* file, std::int32_t number, std::uint8_t how) {
     fhash_variable variable;
+    variable.size = sizeof variable;
     if (fhash_variable_get(file, number, &variable, nullptr)) return;
     std::int64_t region[6];
     std::size_t n = 1;

@@ -6,14 +6,14 @@
 #include "core.hpp"
 #include "inflate.hpp"
 
-FHASH_EXPORT std::int64_t fhash_crc32c(const void* in, std::int64_t n, std::int64_t crc,
+FHASH_KERNEL std::int64_t fhash_crc32c(const void* in, std::int64_t n, std::int64_t crc,
                                        std::int64_t plain);
 
 // Of part.cpp: a tile before its head, and a part of it with its head.
-FHASH_EXPORT int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
                                             const void* stream, size_t size, const int64_t* part,
                                             float* values, int32_t* done, fhash_error* error);
-FHASH_EXPORT int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
+FHASH_KERNEL int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
                                      const float* table, const int64_t* part, void* values,
                                      fhash_error* error);
 

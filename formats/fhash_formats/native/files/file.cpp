@@ -170,8 +170,14 @@ int32_t fhash_variable_get(const fhash_file* file, int32_t number, fhash_variabl
     return reported(error, [&](fhash_error& failed) {
         if (!file || !variable || number < 0 || number >= int32_t(file->variables.size()))
             return fail(failed, FHASH_ERROR_ARGUMENT, "the file has no variable %d", number);
+        constexpr size_t least = sizeof(fhash_variable);  // of the first version
+        const size_t room = variable->size;
+        if (room < least || room > 64 * least)
+            return fail(failed, FHASH_ERROR_ARGUMENT,
+                        "variable->size is %zu; sizeof(fhash_variable) is needed", room);
         const Variable& found = file->variables[size_t(number)];
-        *variable = {};
+        std::memset((void*)variable, 0, room);
+        variable->size = room;
         variable->name = found.name.c_str();
         variable->units = found.units.c_str();
         variable->attributes = found.attributes.c_str();
