@@ -7,6 +7,7 @@ import re
 import shutil
 import struct
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -308,6 +309,33 @@ def test_hdf5_tools_read_and_write(tmp_path: Path) -> None:
         with h5py.File(tmp_path / f"{name}.h5") as file:
             assert str(FILTER) in file["v"]._filters
             assert_kept(file["v"][...], values, bound)
+
+
+def test_a_program_with_hdf5_linked_into_it_says_why_it_cannot_write(tmp_path: Path) -> None:
+    """Its functions are out of reach: a stand-in for HDF5 makes a dataset with the filter."""
+    source = Path(__file__).with_name("static_hdf5.c")
+    links = [f"-L{FOLDER}", "-lfhash", f"-Wl,-rpath,{FOLDER}"]
+    run("gcc", "-std=c99", "-Wall", "-Werror", source, "-o", tmp_path / "program", *links)
+    done = subprocess.run([tmp_path / "program"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "refused\n")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("fhash: H5Pfill_value_defined is not found: this program has HDF5")
+    assert "h5cc -shlib" in line
+
+
+@pytest.mark.parametrize("before", [None, "", "/a/folder"])
+def test_libraries_loaded_later_find_the_plugin(before: str | None) -> None:
+    """That of netCDF4 has an HDF5 of its own, which reads the variable when it is loaded."""
+    script = "import os, fhash_formats.hdf5; print(os.environ['HDF5_PLUGIN_PATH'])"
+    variables = {**os.environ, **({} if before is None else {"HDF5_PLUGIN_PATH": before})}
+    if before is None:
+        variables.pop("HDF5_PLUGIN_PATH", None)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=variables
+    )
+    first, *_, last = done.stdout.strip().split(os.pathsep)
+    assert Path(last) == FOLDER
+    assert first == ("/usr/local/hdf5/lib/plugin" if before is None else before)
 
 
 def test_netcdf_tools_read_and_write(tmp_path: Path) -> None:

@@ -49,6 +49,13 @@ const fhash_quality EXACT = {0, 0, 0, 2, 0};
 
 typedef int64_t Id;  // of HDF5: a type, a list of properties, a space
 
+// Functions that a new dataset needs. A program that HDF5 is linked into shows none or a few.
+const char* const CALLED[] = {
+    "H5Pfill_value_defined", "H5Pget_chunk",   "H5Pget_fill_value", "H5Pget_filter_by_id2",
+    "H5Pmodify_filter",      "H5Tget_class",   "H5Tget_ebias",      "H5Tget_fields",
+    "H5Tget_order",          "H5Tget_precision", "H5Tget_sign",     "H5Tget_size",
+};
+
 // The library of HDF5 that called a function of this one.
 class Hdf5 {
    public:
@@ -240,10 +247,13 @@ bool missing_values(const Hdf5& hdf5, Id properties, Id type, int32_t known,
 // Adds the numbers of a dataset to those of the user.
 bool complete(const Hdf5& hdf5, Id properties, Id type, std::vector<unsigned>& numbers,
               unsigned& flags, fhash_error& error) {
-    if (!hdf5.find("H5Pmodify_filter")) {
-        return fail(error, FHASH_ERROR_UNSUPPORTED,
-                    "this program has HDF5 linked into it, and hides its functions from the "
-                    "filter: link HDF5's shared library (h5cc -shlib), or with -rdynamic");
+    for (const char* name : CALLED) {
+        if (!hdf5.find(name)) {
+            return fail(error, FHASH_ERROR_UNSUPPORTED,
+                        "%s is not found: this program has HDF5 linked into it; to write with the "
+                        "filter, link HDF5's shared library (h5cc -shlib)",
+                        name);
+        }
     }
     std::vector<unsigned> given(LEAST + 2 * (MAX_MISSING + 1));
     size_t count = given.size();
