@@ -81,12 +81,18 @@ class Packing:
 
 
 def packing(
-    source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fill_value: Any = None
+    source: str,
+    dtype: np.dtype[Any],
+    attributes: Mapping[str, Any],
+    fill_value: Any = None,
+    *,
+    gaps: bool = False,
 ) -> Packing:
     """The packing that an array's attributes describe.
 
     attributes: JSON values, or as h5py gives them. fill_value: a further fill value, from zarr's
-    own metadata. Raises InputError for an attribute that is not a number.
+    own metadata. gaps: whether values may be missing for which no number stands. Raises InputError
+    for an attribute that is not a number.
     """
     stored = dtype.newbyteorder("=")
     told = text_of(_single(attributes.get("_Unsigned", ""))).lower()
@@ -106,6 +112,7 @@ def packing(
         _number(source, "scale_factor", scale),
         _number(source, "add_offset", offset),
         _scaled_type(stored, scale, offset),
+        gaps=gaps,
     )
 
 
@@ -135,13 +142,15 @@ def _packing(
     scale: float | None = None,
     offset: float | None = None,
     scaled: np.dtype[Any] | None = None,
+    *,
+    gaps: bool = False,
 ) -> Packing:
     """A packing without fills that are nowhere (None), or mark themselves (NaN)."""
     kept = tuple(fill for fill in fills if fill is not None and fill == fill)
     dtype = stored
     if scaled is not None and (scale is not None or offset is not None):
         dtype = scaled
-    elif kept and stored.kind in "iu":
+    elif (kept or gaps) and stored.kind in "iu":
         dtype = np.dtype(np.float32 if stored.itemsize <= 2 else np.float64)
     return Packing(stored=stored, dtype=dtype, fills=kept, scale=scale, offset=offset)
 

@@ -38,6 +38,7 @@ from fhash_formats.readers.variables import (
     placed,
     positions,
 )
+from fhash_formats.readers.vtk import without_hidden
 from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import decoded_text
 
@@ -412,6 +413,7 @@ def open_legacy_vtk(path: Path, request: Request) -> Source:
                 whole = FlatArray(path, shape, array.dtype, stored=array.stored)
                 parts += components(whole.variable(full, AXES[1:]), len(space))
             coords = reader.coordinates(cells=cells) if parts else {}
+            parts = without_hidden(parts, "CellData" if cells else "PointData")
             found += placed(parts, coords, f"header/{section}")
     return file_source(path, found, stamp=stamp)
 

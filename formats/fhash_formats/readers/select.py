@@ -182,14 +182,21 @@ class Selection:
         if variable.field or variable.dtype.kind not in "iuf":
             return None
         told = variable.attributes if variable.values is None else variable.handle
-        return packing(self.source, variable.dtype, told)
+        return packing(self.source, variable.dtype, told, gaps=variable.hidden is not None)
 
     def _unpacking(self, variable: Variable) -> Read:
-        """The function that reads values in physical units."""
-        packed = self.packing(variable)
+        """The function that reads values in physical units, NaN for hidden ones."""
+        packed, hidden = self.packing(variable), variable.hidden
         if packed is None or variable.values is not None:
             return variable.read
-        return lambda places: packed.unpack(np.asarray(variable.read(places)))
+
+        def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+            values = packed.unpack(np.array(variable.read(places), copy=hidden is not None or None))
+            if hidden is not None:
+                values[hidden(places)] = np.nan
+            return values
+
+        return read
 
     def reading(self, variable: Variable) -> Read:
         """The function that reads the values of a variable, of all its steps."""

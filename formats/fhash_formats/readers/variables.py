@@ -109,6 +109,8 @@ class Variable:
         field: path of names in a compound type, () where the array is no such.
         members: arrays of the same kind, one a step; () for an array that the file holds as one
             (`join`).
+        hidden: gives, for places along each dimension, True where the format says that the value is
+            to be ignored; None where all count. Such values are missing.
     """
 
     name: str
@@ -130,6 +132,7 @@ class Variable:
     handle: Any = None
     field: tuple[str, ...] = ()
     members: tuple[Variable, ...] = ()
+    hidden: Read | None = None
 
     def __post_init__(self) -> None:
         given = [None if each and each.startswith(MADE_UP) else each for each in self.dimensions]

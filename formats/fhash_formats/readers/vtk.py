@@ -29,6 +29,7 @@ from fhash_formats.readers.variables import (
     components,
     file_source,
     placed,
+    plain_name,
     positions,
 )
 from fhash_formats.readers.vtk_document import Document, Element, VtkArrays
@@ -41,8 +42,19 @@ KINDS = ("ImageData", "RectilinearGrid")
 PARALLEL_KINDS = ("PImageData", "PRectilinearGrid")
 """Kinds of files that list the files of their pieces."""
 PLACES = ("PointData", "CellData")
-GHOSTS = ("vtkGhostType", "vtkValidPointMask")
-"""Arrays that say which values count, and are none themselves."""
+GHOSTS = {
+    "vtkGhostType": {"PointData": 2, "CellData": 32},
+    "avtGhostNodes": {"PointData": 2},
+    "avtGhostZones": {"CellData": 16 | 32},
+    "vtkGhostLevels": {},
+    "vtkValidPointMask": {"PointData": 0},
+}
+"""Arrays that say which values count, and are none themselves, with the bits of values to ignore.
+
+Sources: HIDDENPOINT and HIDDENCELL (vtkDataSetAttributes.h); NODE_NOT_APPLICABLE_TO_PROBLEM, and
+ZONE_EXTERIOR_TO_PROBLEM and ZONE_NOT_APPLICABLE_TO_PROBLEM (VisIt's avtGhostData.h). Other bits and
+levels are those of duplicates, which are sound. 0: the number 0 hides a value.
+"""
 
 EVEN = ("0 0 0", "1 1 1", "1 0 0 0 1 0 0 0 1")
 """Origin, spacing and direction where a file does not say them."""
@@ -179,13 +191,39 @@ def _arrays(source: str, grid: _Grid, place: str) -> list[Variable]:
             dtype=first.arrays.dtype(element),
             dimensions=SPACE,
             attributes=_units(element),
-            auxiliary=name in GHOSTS,
             read=partial(_read, source, grid, place, number),
             require=partial(_check, source, grid, place, number),
         )
         parts = [element.attributes.get(f"ComponentName{i}") for i in range(int(text))]
         found += components(whole, len(SPACE), parts)
-    return found
+    return without_hidden(found, place)
+
+
+def without_hidden(arrays: Sequence[Variable], place: str) -> list[Variable]:
+    """The arrays of points or of cells, those of GHOSTS auxiliary, and what these hide hidden.
+
+    place: "PointData" or "CellData".
+    """
+    ghosts = [each for each in arrays if plain_name(each.name) in GHOSTS]
+    marks = [
+        (each, GHOSTS[plain_name(each.name)][place])
+        for each in ghosts
+        if place in GHOSTS[plain_name(each.name)]
+    ]
+
+    def hidden(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        found = []
+        for each, bits in marks:
+            marked = np.asarray(each.read(places)).astype(np.int64)
+            found.append((marked & bits) != 0 if bits else marked == 0)
+        return np.any(found, axis=0)
+
+    return [
+        replace(each, auxiliary=True)
+        if each in ghosts
+        else replace(each, hidden=hidden if marks else None)
+        for each in arrays
+    ]
 
 
 def _named(element: Element) -> str:
@@ -402,7 +440,7 @@ def _hdf_arrays(
             found.append(Variable(name=full, shape=shape, dtype=stored.dtype, error=error))
             continue
         dims = SPACE if times is None else (AXIS_NAMES["t"], *SPACE)
-        whole = replace(stored, name=full, dimensions=dims, auxiliary=name in GHOSTS, scales={})
+        whole = replace(stored, name=full, dimensions=dims, scales={})
         if times is not None:
             offsets = known.get(f"Steps/{place}Offsets/{name}")
             entries = np.arange(times.shape[0]) if offsets is None else offsets.whole()
@@ -416,7 +454,7 @@ def _hdf_arrays(
             )
         vector = len(inner) > len(space)
         found += components(whole, len(dims), interleaved=False) if vector else [whole]
-    return found
+    return without_hidden(found, place)
 
 
 def _hdf_read(
