@@ -16,7 +16,7 @@ from fhash_codec.measure.errors import row_sums
 from fhash_codec.measure.value_range import PIECE, Mean, Ranks, RanksSpan, ValueRange, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
-from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults
+from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults, warn_outside
 from fhash_formats.support.threads import map_ahead, one_ahead, thread_pool
 from fhash_formats.support.values import Values, exact_number
 
@@ -277,17 +277,19 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     kept = series.held is None and size <= HELD_BYTES
     held = np.empty(series.shape, series.dtype) if kept else None
 
-    def look(at: tuple[range, Values]) -> tuple[range, Values, _Figures, int]:
+    def look(at: tuple[range, Values]) -> tuple[range, Values, _Figures, int, int]:
         block, frames = at
         if held is not None:
             held[block.start : block.stop] = frames
         own = _Figures(series)
-        return block, frames, own, own.add(frames)
+        return block, frames, own, own.add(frames), series.outside(frames)
 
+    outside = 0
     with thread_pool() as workers:
         blocks = one_ahead(series.blocks(range(steps)))
         looks = map_ahead(workers, look, blocks, BLOCKS_AHEAD)
-        for block, frames, own, finite in looks:
+        for block, frames, own, finite, beyond in looks:
+            outside += beyond
             figures.join(own)
             if finite < frames.size:
                 _add_missing(missing, block, frames)
@@ -305,6 +307,7 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
         )
     found = figures.scan(series, missing)
     warn_defaults(series)
+    warn_outside(series, outside)
     return found
 
 

@@ -33,6 +33,7 @@ from fhash_formats.support.dates import (
     UNITS,
     clock,
     in_days,
+    is_numeric_date,
     of_texts,
 )
 from fhash_formats.support.values import STORED, json_attributes, text_of
@@ -114,6 +115,36 @@ def packing(
         _scaled_type(stored, scale, offset),
         gaps=gaps,
     )
+
+
+def valid_limits(packed: Packing, attributes: Mapping[str, Any]) -> tuple[Any, Any] | None:
+    """The least and the greatest valid value in the units of unpacked ones; None without any.
+
+    CF 1.11, section 2.5.1: they count packed numbers, unless they are floats and those are not.
+    Attributes that are no numbers say nothing.
+    """
+    told = np.ravel(attributes.get("valid_range", ()))
+    given = told if told.size == 2 else [attributes.get(f"valid_{end}") for end in ("min", "max")]
+    ends: list[Any] = [-math.inf, math.inf]
+    for place, each in enumerate(map(_single, given)):
+        if not isinstance(each, int | float | np.integer | np.floating) or each != each:
+            continue
+        integers, whole = packed.stored.kind in "iu", isinstance(each, int | np.integer)
+        if packed.scaled and (whole or not integers):
+            limits = np.iinfo(packed.stored) if integers else None
+            if limits is not None:  # those of _Unsigned numbers may be written signed
+                each = int(each) % (1 << limits.bits) if limits.min == 0 else int(each)
+                each = min(max(each, int(limits.min)), int(limits.max))
+            stored = np.array([each], packed.stored)
+            each = replace(packed, fills=()).unpack(stored)[0]
+        elif integers and whole and packed.stored.kind == "u" and each < 0:
+            each = int(each) + (1 << 8 * packed.stored.itemsize)
+        ends[place] = each.item() if isinstance(each, np.generic) else each
+    if ends == [-math.inf, math.inf]:
+        return None
+    turned = packed.scaled and (1.0 if packed.scale is None else packed.scale) < 0
+    low, high = ends[::-1] if turned and told.size == 2 else ends
+    return (low, high)
 
 
 def note_packing(series: Series, packed: Packing) -> None:
@@ -266,6 +297,8 @@ def role_of_coordinate(name: str, attributes: Mapping[str, Any]) -> str | None:
     axis = str(attributes.get("axis", "")).lower()
     if axis in AXES:
         return axis
+    if is_numeric_date(str(attributes.get("units", ""))):
+        return "t"
     for key, patterns in AXIS_PATTERNS.items():
         text = str(attributes.get(key, "")).strip().lower()
         for role, pattern in patterns.items():
@@ -309,6 +342,8 @@ def is_time(name: str, attributes: Mapping[str, Any], dtype: np.dtype[Any]) -> b
     units = str(attributes.get("units", "")).strip()
     if dtype.kind == "M" or SINCE.fullmatch(units) or units.lower() in UNITS:
         return True
+    if is_numeric_date(units):
+        return True
     name = str(attributes.get("standard_name", "")).strip().lower()
     return name in ("time", "forecast_period", "forecast_reference_time")
 
@@ -344,7 +379,8 @@ def real_time(named: Column | None, others: Iterable[Column]) -> Column | None:
 def _rank(column: Column) -> int | None:
     """Place among coordinates of time, the first is best; None for one that is no time."""
     name, attributes, dtype = column.described
-    if dtype.kind == "M" or SINCE.fullmatch(str(attributes.get("units", ""))):
+    units = str(attributes.get("units", ""))
+    if dtype.kind == "M" or SINCE.fullmatch(units) or is_numeric_date(units):
         # the start of a forecast is the same for all of its steps
         return 3 if attributes.get("standard_name") == "forecast_reference_time" else 0
     known = name.lower() in NAMES["t"].split() or role_of_coordinate(name, attributes) == "t"
@@ -356,9 +392,9 @@ def _rank(column: Column) -> int | None:
 def settled(coordinate: Coordinate) -> tuple[Coordinate, str]:
     """The times that stand for those of a file, and what is to be said of it, "" where nothing is.
 
-    Months, years and weeks are counted anew in days. Where a time is missing, the numbers of the
-    steps stand for all. Units that name no date are no `units` any more, since programs that decode
-    CF refuse them; the numbers stay.
+    Months, years, weeks and dates written as numbers are counted anew in days. Where a time is
+    missing, the numbers of the steps stand for all. Units that name no date are no `units` any
+    more, since programs that decode CF refuse them; the numbers stay.
     """
     name, attributes = coordinate.name, coordinate.attributes
     missing = np.flatnonzero(~np.isfinite(coordinate.values))
@@ -443,7 +479,9 @@ def _decodable(attributes: Mapping[str, Any]) -> bool:
     """Whether programs that decode CF make dates of a coordinate, or take it as numbers."""
     unit, known = _unit(attributes), clock(attributes) is not None
     calendar = str(attributes.get("calendar") or "standard").strip().lower()
-    return known == bool(unit) and not unit.startswith("week") and calendar != "360"
+    anew = unit.startswith(("week", "common_year")) or calendar == "360"
+    anew = anew or is_numeric_date(str(attributes.get("units", "")))
+    return known == bool(unit) and not anew
 
 
 def _undated(attributes: Mapping[str, Any]) -> dict[str, Any]:

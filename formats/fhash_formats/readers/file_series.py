@@ -17,7 +17,12 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import FhashError, InputError, MissingDependencyError
+from fhash_formats.errors import (
+    FhashError,
+    InputError,
+    MissingDependencyError,
+    MissingInputError,
+)
 from fhash_formats.readers.cf import Packing, missing_values, note_packing, settled
 from fhash_formats.series import (
     AXES,
@@ -175,6 +180,16 @@ class Request:
         if self.no_external:
             for file in files:
                 inside_folder(path, file)
+
+    def beside(self, path: Path, file: Path) -> Path:
+        """A file that another one names: no reader opens such a file in another way.
+
+        Raises InputError for one that may not be read, and MissingInputError where it is not there.
+        """
+        self.require_inside(path, file)
+        if not file.is_file():
+            raise MissingInputError(f"{path} names {file}, which is not there")
+        return file
 
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was named for a format that has none."""

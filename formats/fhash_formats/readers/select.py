@@ -30,6 +30,7 @@ from fhash_formats.readers.cf import (
     role_of_coordinate,
     role_of_name,
     usable,
+    valid_limits,
     written_times,
 )
 from fhash_formats.readers.file_series import (
@@ -547,6 +548,9 @@ class Selection:
         name = plain_name(shown_name(variable.name, names))
         attributes = json_attributes(variable.attributes, without=without) | layout.attributes()
         series = FileSeries(name, stored, coords, attributes)
+        limits = packed or (None if scaled else self.declared(variable))
+        if limits is not None and not variable.field:
+            series.valid = valid_limits(limits, variable.attributes)
         if not variable.members and not variable.field:
             unfit = without if request.raw_values else frozenset[str]()
             series.metadata = partial(

@@ -629,6 +629,11 @@ def components(
         all are read for one.
     """
     count = whole.shape[place]
+    if count > MAX_COMPONENTS:
+        raise InputError(
+            f"{whole.name} has {count} components; {MAX_COMPONENTS} can be told apart, --axes says"
+            " what the dimension is"
+        )
 
     def one(number: int, name: str) -> Variable:
         def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
@@ -660,6 +665,9 @@ def _component_names(count: int, given: Sequence[str | None]) -> list[str]:
         return names
     return list(LETTERS) if count == len(LETTERS) else [str(number) for number in range(count)]
 
+
+MAX_COMPONENTS = 1 << 12
+"""Components of an array, each of which is a variable."""
 
 LETTERS = ("x", "y", "z")
 """Names of the components of a vector with three of them."""
