@@ -24,6 +24,7 @@ from fhash_formats.readers.cf import (
     beside,
     coordinate,
     counts_steps,
+    missing_values,
     only_counts,
     packing,
     real_time,
@@ -548,8 +549,8 @@ class Selection:
         name = plain_name(shown_name(variable.name, names))
         attributes = json_attributes(variable.attributes, without=without) | layout.attributes()
         series = FileSeries(name, stored, coords, attributes)
-        limits = packed or (None if scaled else self.declared(variable))
-        if limits is not None and not variable.field:
+        if variable.dtype.kind in "iuf" and not variable.field and not scaled:
+            limits = packed or missing_values(self.source, variable.dtype, ())
             series.valid = valid_limits(limits, variable.attributes)
         if not variable.members and not variable.field:
             unfit = without if request.raw_values else frozenset[str]()

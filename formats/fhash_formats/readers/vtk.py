@@ -21,6 +21,7 @@ from fhash_formats.readers.hdf5 import is_hdf5, open_hdf5
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.select import open_selected
 from fhash_formats.readers.stored_bytes import axis_steps, lattice, numbers_of
+from fhash_formats.readers.stored_parts import hdf5_file
 from fhash_formats.readers.variables import (
     HEADER,
     Behind,
@@ -367,11 +368,9 @@ def is_vtkhdf(head: bytes, path: Path) -> bool:
     if path.suffix.lower() in VTKHDF_SUFFIXES:
         return True
     try:
-        import h5py
-
-        with h5py.File(path, "r") as file:
+        with hdf5_file(path) as file:
             return "VTKHDF" in file
-    except (ImportError, OSError, RuntimeError, KeyError):
+    except (ImportError, InputError, OSError, RuntimeError, KeyError):
         return False  # the reader of HDF5 says what is wrong
 
 
