@@ -18,7 +18,7 @@ from fhash_formats.errors import FhashWarning, InputError, MissingDependencyErro
 from fhash_formats.readers.file_series import Request, Stamp, naming, refusing
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.simulations import athena_variables, flash_variables, in_place_of
-from fhash_formats.readers.stored_bytes import lattice
+from fhash_formats.readers.stored_bytes import lattice, require_length
 from fhash_formats.readers.stored_parts import Hdf5Sources, hdf5_file
 from fhash_formats.readers.variables import (
     Behind,
@@ -533,6 +533,8 @@ def openpmd_lines(
     spacing = _numbers(known.get("gridSpacing"), len(shape), 1.0)[::way]
     offset = _numbers(known.get("gridGlobalOffset"), len(shape), 0.0)[::way]
     place = _numbers(json_attributes(component).get("position"), len(shape), 0.0)[::way]
+    for label, length in zip(labels, shape, strict=True):
+        require_length(str(label), length)
     unit = known.get("gridUnitSI")
     scale = float(unit) if isinstance(unit, int | float) else 1.0
     return {

@@ -50,6 +50,7 @@ from fhash_formats.readers.layout import (
     with_roles,
 )
 from fhash_formats.readers.listing import Listed, listing
+from fhash_formats.readers.stored_bytes import require_length
 from fhash_formats.readers.stored_parts import not_stored, warn_of_column
 from fhash_formats.readers.surroundings import (
     MAX_ARRAYS,
@@ -356,6 +357,7 @@ class Selection:
     def _made_column(self, variable: Variable) -> Column:
         @cache
         def read() -> npt.NDArray[Any]:
+            require_length(variable.name, max(variable.shape, default=1))
             parts = variable.behind().parts
             if parts is not None and parts.fill == parts.fill:
                 warn_of_column(variable.name, parts)

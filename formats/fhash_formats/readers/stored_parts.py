@@ -76,8 +76,8 @@ def hdf5_file(path: Path) -> Any:
         if "truncated file" in text:
             size, promised = path.stat().st_size, text.rpartition("=")[2].strip(" )")
             raise InputError(
-                f"{path} cannot be read as HDF5: it is cut: it has {size} bytes, its header promises"
-                f" {promised}"
+                f"{path} cannot be read as HDF5: it is cut: it has {size} bytes, {promised} are"
+                " promised"
             ) from error
         raise
 

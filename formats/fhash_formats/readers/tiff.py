@@ -265,6 +265,8 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source 
     differ from the first.
     """
     tifffile = library(pattern, "TIFF", "tifffile", "fhash[formats]")
+    for path in paths:
+        request.beside(path, path)
     with naming(str(paths[0])), _strictly(), tifffile.TiffFile(paths[0]) as file:
         if len(file.series) != 1 or len(paths) == 1:
             return None
