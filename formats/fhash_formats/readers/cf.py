@@ -41,6 +41,11 @@ from fhash_formats.support.values import STORED, json_attributes, text_of
 SCALING = frozenset(("scale_factor", "add_offset"))
 """Attributes that make stored numbers counts of another unit."""
 
+OTHER_FILLS = frozenset(("fillvalue", "missingvalue", "codemissingvalue", "nodata", "nodatavalue"))
+OTHER_SCALES = {"scalefactor": 1, "slope": 1, "scale": 1, "offset": 0, "intercept": 0}
+"""Other names of fill values, and of a scale and an offset with what changes nothing, as files of
+HDF-EOS, GPM and MODIS have them: in lower case, without "_"."""
+
 AS_STORED = "; --raw-values reads the numbers as they are stored"
 """Advice where attributes make no sense."""
 
@@ -104,6 +109,11 @@ def packing(
     values: list[Any] = []
     for value in (fill_value, attributes.get("_FillValue"), attributes.get("missing_value")):
         values += value if isinstance(value, list | tuple | np.ndarray) else [value]
+    for name in attributes:
+        if _bare(name) in OTHER_FILLS and name not in ("_FillValue", "missing_value"):
+            listed = np.ravel(attributes[name])[:MAX_FILLS].tolist()
+            numbers = [number_of_text(text_of(each)) for each in listed]
+            values += [each for each in numbers if each is not None and each == each]
     unsigned = other and stored.kind == "i"
     fills = [_fill(source, each, stored, unsigned=unsigned) for each in values if each is not None]
     scale, offset = (_single(attributes.get(name)) for name in ("scale_factor", "add_offset"))
@@ -115,6 +125,26 @@ def packing(
         _scaled_type(stored, scale, offset),
         gaps=gaps,
     )
+
+
+MAX_FILLS = 16
+"""Fill values of one attribute."""
+
+
+def _bare(name: str) -> str:
+    """The name of an attribute in lower case without "_"."""
+    return name.replace("_", "").lower()
+
+
+def unapplied(attributes: Mapping[str, Any]) -> str:
+    """Attributes that may scale the values, and follow no convention; "" without any."""
+    found = []
+    for name in attributes:
+        value = _single(attributes[name])
+        number = name not in SCALING and isinstance(value, int | float | np.integer | np.floating)
+        if number and value != OTHER_SCALES.get(_bare(name), value):
+            found.append(f"{name} = {value:.9g}")
+    return ", ".join(found)
 
 
 def valid_limits(packed: Packing, attributes: Mapping[str, Any]) -> tuple[Any, Any] | None:

@@ -336,8 +336,8 @@ def open_dx(path: Path, request: Request) -> Source:
         if not first or not short or prod(map(int, _behind(told, "shape", -1))) != 1:
             raise InputError("it holds no array of numbers, one for each position")
         if prod(sizes) != count_of(items[0], "items", most):
-            told = f"{prod(sizes)} positions, and its array {items[0]} items"
-            raise InputError(f"its grid has {told}")
+            has = f"{prod(sizes)} positions, and its array {items[0]} items"
+            raise InputError(f"its grid has {has}")
         grid = words[:first]
         origin = numbers_of(" ".join(_behind(grid, "origin", 3) or "000"), 3)
         places = [n for n, word in enumerate(grid) if word == "delta"]
@@ -350,8 +350,8 @@ def open_dx(path: Path, request: Request) -> Source:
         dtype = np.dtype(("<" if "lsb" in told else ">") + short)
         is_text = not {"binary", "ieee"} & {*told}
         values = _values_at(path, header.file, tuple(sizes), dtype, is_text=is_text)
-        lines = zip("xyz", origin.tolist(), steps, sizes, strict=True)
-        coords = {axis: lattice(axis, *each) for axis, *each in lines}
+        lines = zip(origin.tolist(), steps, sizes, strict=True)
+        coords = {axis: lattice(axis, *each) for axis, each in zip("xyz", lines, strict=True)}
     return file_source(path, placed([values.variable(path.stem, "xyz")], coords), stamp=stamp)
 
 
@@ -613,6 +613,12 @@ def _whole(array: FlatArray) -> npt.NDArray[np.float64]:
 SEGY_SUFFIXES = (".sgy", ".segy")
 LINES = {"inline": 189, "crossline": 193}
 """Bytes of the numbers of lines in the header of a trace (SEG-Y revision 1)."""
+TRACE_KIND, DEAD = 29, (2, 3)
+"""Byte of what a trace is, and its codes for traces without values: dead ones and dummies."""
+SEGY_ORDER = {b"\4\3\2\1": "little", b"\3\4\1\2": "pairs"}
+"""Byte orders other than big by the number 16909060 at byte 3297 (SEG-Y revision 2)."""
+SEGY_TYPES = (1, 2, 3, 5, 6, 8, 9, 10, 11, 12, 16)
+"""Codes of number types that segyio knows; it takes others for IBM's floats."""
 
 
 def is_segy(head: bytes, path: Path) -> bool:
@@ -629,7 +635,13 @@ def open_segy(path: Path, request: Request) -> Source:
     source, stamp = str(path), Stamp.of(path)
     segyio = library(source, "SEG-Y", "segyio", "fhash[segy]")
     with naming(source), ExitStack() as opened:
-        file = opened.enter_context(segyio.open(source, ignore_geometry=True))
+        with path.open("rb") as stored:
+            told = stored.read(3600)[3200:]
+        order = SEGY_ORDER.get(told[96:100], "big")
+        kind = int.from_bytes(told[24:26], "little" if order == "little" else "big")
+        if order == "pairs" or kind not in SEGY_TYPES:
+            raise InputError(f"its values are of type {kind} in the byte order {order}")
+        file = opened.enter_context(segyio.open(source, ignore_geometry=True, endian=order))
         found, close = _traces(path, file), opened.pop_all().close
     return file_source(path, found, stamp=stamp, close=close)
 
@@ -660,6 +672,12 @@ def _traces(path: Path, file: Any) -> list[Variable]:
         starts = [line * shape[1] for line in slow]
         return np.stack([raw[n + fast.start : n + fast.stop][:, kept] for n in starts])
 
+    dead = np.isin(file.attributes(TRACE_KIND)[:], DEAD).reshape(shape[:-1])
+
+    def hidden(places: tuple[slice | int, ...]) -> npt.NDArray[np.bool_]:
+        part = dead[places[:2]]
+        return part if isinstance(places[2], int) else part[..., None]
+
     axes = {"inline": "Y", "crossline": "X", "trace": "X", "sample": "Z"}
     whole = Variable(
         name=path.stem,
@@ -667,6 +685,7 @@ def _traces(path: Path, file: Any) -> list[Variable]:
         dtype=np.dtype(file.dtype),
         dimensions=tuple(columns),
         read=by_ranges(shape, get),
+        hidden=hidden if dead.any() else None,
     )
     units = {"sample": {"units": "ms", "positive": "down"}}
     coords = [

@@ -6,6 +6,7 @@ mean is decided once, by the CF conventions (1.11) where a source follows them.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.cf import (
     SCALING,
     Column,
@@ -30,6 +31,7 @@ from fhash_formats.readers.cf import (
     real_time,
     role_of_coordinate,
     role_of_name,
+    unapplied,
     usable,
     valid_limits,
     written_times,
@@ -196,7 +198,7 @@ class Selection:
         def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
             values = packed.unpack(np.array(variable.read(places), copy=hidden is not None or None))
             if hidden is not None:
-                values[hidden(places)] = np.nan
+                values[np.broadcast_to(hidden(places), values.shape)] = np.nan
             return values
 
         return read
@@ -554,6 +556,13 @@ class Selection:
         if variable.dtype.kind in "iuf" and not variable.field and not scaled:
             limits = packed or missing_values(self.source, variable.dtype, ())
             series.valid = valid_limits(limits, variable.attributes)
+        if (scales := unapplied(variable.attributes)) and not request.raw_values:
+            warnings.warn(
+                f"{self.source}: {name} has {scales}, which no convention known here applies; its"
+                " numbers are read as they are stored",
+                FhashWarning,
+                stacklevel=2,
+            )
         if not variable.members and not variable.field:
             unfit = without if request.raw_values else frozenset[str]()
             series.metadata = partial(

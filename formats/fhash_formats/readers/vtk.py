@@ -140,7 +140,8 @@ def _grid(
         )
     extent = _extent(element.attributes.get("WholeExtent", ""))
     arrays = VtkArrays(path, document)
-    holders, files, pieces = [(element, arrays), (root, arrays)], [], []
+    files: list[Path] = []
+    holders, pieces = [(element, arrays), (root, arrays)], []
     for piece in element.all("Piece"):
         own = _extent(piece.attributes.get("Extent", element.attributes["WholeExtent"]))
         if any(last < first for first, last in own):
@@ -226,7 +227,8 @@ def without_hidden(arrays: Sequence[Variable], place: str) -> list[Variable]:
         for each, bits in marks:
             marked = np.asarray(each.read(places)).astype(np.int64)
             found.append((marked & bits) != 0 if bits else marked == 0)
-        return np.any(found, axis=0)
+        values: npt.NDArray[np.bool_] = np.any(found, axis=0)
+        return values
 
     return [
         replace(each, auxiliary=True)

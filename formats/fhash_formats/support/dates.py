@@ -186,8 +186,9 @@ def in_days(
             days = Clock(unit=DAY, epoch=instants(match[2], calendar)[0], calendar=calendar)
             exact = [_months_later(days, Fraction(value) * months) for value in values]
         elif (written := NUMERIC.fullmatch(units)) is not None and calendar and values:
-            exact = [_of_digits(value, written, calendar) for value in values]
-            days = Clock(unit=DAY, epoch=exact[0] // DAY * DAY, calendar=calendar)
+            exact = [Fraction(_of_digits(value, written, calendar)) for value in values]
+            epoch = int(exact[0]) // DAY * DAY
+            days = Clock(unit=DAY, epoch=epoch, calendar=calendar)
         else:
             return None
     except InputError:

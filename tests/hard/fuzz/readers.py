@@ -150,7 +150,7 @@ KINDS: tuple[Callable[[random.Random, bytearray], bytes], ...] = (
 
 
 def mutated(chance: random.Random, data: bytes) -> bytes:
-    """Other bytes of a file; those of a compressed one are mostly changed before they are packed."""
+    """Other bytes of a file; those of a compressed one mostly change before they are packed."""
     packed = data[:2] == b"\x1f\x8b" and chance.random() < 0.8
     changed = gzip.decompress(data) if packed else data
     for _ in range(chance.choice((1, 1, 1, 2, 4))):
