@@ -141,8 +141,9 @@ def unapplied(attributes: Mapping[str, Any]) -> str:
     found = []
     for name in attributes:
         value = _single(attributes[name])
-        number = name not in SCALING and isinstance(value, int | float | np.integer | np.floating)
-        if number and value != OTHER_SCALES.get(_bare(name), value):
+        known = _bare(name) in OTHER_SCALES and name not in SCALING
+        number = isinstance(value, int | float | np.integer | np.floating)
+        if known and number and value != OTHER_SCALES[_bare(name)]:
             found.append(f"{name} = {value:.9g}")
     return ", ".join(found)
 

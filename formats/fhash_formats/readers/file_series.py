@@ -325,6 +325,16 @@ of several frames of 128^3 float64 are decompressed once, and memory stays small
 encoder's own.
 """
 
+MAX_AXIS = 1 << 24
+"""Positions along an axis of a file, which take 128 MiB."""
+
+
+def require_length(axis: str, count: int) -> None:
+    """Raise InputError for more positions along an axis than there can be."""
+    if count > MAX_AXIS:
+        raise InputError(f"it has {count} positions along {axis}; {MAX_AXIS} are possible")
+
+
 Fetch = Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
 
 
@@ -391,6 +401,8 @@ class FileSeries(Series):
         self.source, self.name, self.dtype = stored.source, plain_text(name), native(stored.dtype)
         self.files = () if stored.stamp is None else (Path(stored.source), *stored.beside)
         self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
+        for axis, length in zip(AXES, self.shape, strict=True):
+            require_length(axis, length)
         self.attributes = dict(attributes)
         self.units = str(self.attributes.get("units", ""))
         if "t" in coords:

@@ -17,11 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.file_series import Request, Stamp, library, naming
+from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming
 from fhash_formats.readers.stored_bytes import (
     GZIP,
     LONGEST_NUMBER,
-    MAX_AXIS,
     MAX_LINE,
     TYPES,
     CompressedFile,

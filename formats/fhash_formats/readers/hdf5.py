@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
-from fhash_formats.readers.file_series import Request, Stamp, naming, refusing
+from fhash_formats.readers.file_series import Request, Stamp, naming, refusing, require_length
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.simulations import athena_variables, flash_variables, in_place_of
-from fhash_formats.readers.stored_bytes import lattice, require_length
+from fhash_formats.readers.stored_bytes import lattice
 from fhash_formats.readers.stored_parts import Hdf5Sources, hdf5_file
 from fhash_formats.readers.variables import (
     Behind,

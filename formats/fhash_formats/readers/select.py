@@ -42,6 +42,7 @@ from fhash_formats.readers.file_series import (
     Request,
     Stored,
     refusing,
+    require_length,
 )
 from fhash_formats.readers.layout import (
     Dimension,
@@ -52,7 +53,6 @@ from fhash_formats.readers.layout import (
     with_roles,
 )
 from fhash_formats.readers.listing import Listed, listing
-from fhash_formats.readers.stored_bytes import require_length
 from fhash_formats.readers.stored_parts import not_stored, warn_of_column
 from fhash_formats.readers.surroundings import (
     MAX_ARRAYS,

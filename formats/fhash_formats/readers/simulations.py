@@ -20,10 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import Request, Stamp, library, naming
+from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.stored_bytes import (
-    MAX_AXIS,
     MAX_HEADER,
     TYPES,
     FlatArray,

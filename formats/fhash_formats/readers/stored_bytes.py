@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import naming
+from fhash_formats.readers.file_series import naming, require_length
 from fhash_formats.readers.variables import Variable, by_ranges, positions
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.values import decoded_text, is_number
@@ -41,9 +41,6 @@ MAX_HEADER = 64 * 2**20
 
 MAX_LINE = 1 << 16
 """Bytes of the longest line of a header but for those that list coordinates."""
-
-MAX_AXIS = 1 << 24
-"""Positions along an axis, which take 128 MiB."""
 
 
 class Header:
@@ -474,12 +471,6 @@ def lattice(
 
     made = positions(AXIS_NAMES[axis], np.empty(0), {"units": units} if units else {})
     return replace(made, shape=(count,), read=read)
-
-
-def require_length(axis: str, count: int) -> None:
-    """Raise InputError for more positions along an axis than there can be."""
-    if count > MAX_AXIS:
-        raise InputError(f"it has {count} positions along {axis}; {MAX_AXIS} are possible")
 
 
 def axis_steps(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming
+from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming, require_length
 from fhash_formats.readers.hdf5 import is_hdf5, open_hdf5
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.select import open_selected
@@ -26,7 +26,6 @@ from fhash_formats.readers.stored_bytes import (
     axis_steps,
     lattice,
     numbers_of,
-    require_length,
 )
 from fhash_formats.readers.stored_parts import hdf5_file
 from fhash_formats.readers.variables import (
