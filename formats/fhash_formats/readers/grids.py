@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming
+from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming, refusing
 from fhash_formats.readers.stored_bytes import (
     GZIP,
     LONGEST_NUMBER,
@@ -130,7 +130,7 @@ def open_nifti(path: Path, request: Request) -> Source:
             raise InputError(f"its header says that it has {size} bytes; NIfTI has 348 or 540")
         form = [tuple(each.split(":")) for each in (NIFTI_1 if size == 348 else NIFTI_2).split()]
         if len(data) < size:
-            raise InputError(f"its header has {len(data)} bytes, {size} are needed")
+            raise InputError(f"its header has {len(data)} bytes, {size} are needed; it is cut")
         header = np.frombuffer(data, np.dtype(form).newbyteorder(end), count=1)[0]
         count = int(header["dim"][0])
         if not 1 <= count <= 7 or (header["dim"][1 : count + 1] < 1).any():
@@ -575,7 +575,7 @@ class _LegacyReader:
         elif key == "LOOKUP_TABLE" and len(words) == 3:
             self._array("", words[2], "4", "float" if self._text else "unsigned_char")
         else:
-            raise InputError(f"it has the line {' '.join(words)[:60]!r}, which is not known")
+            raise InputError(f"it has the line {' '.join(words)[:60]!r}, which is cut or not known")
 
     def _fields(self, count: int) -> None:
         for _ in range(count):
@@ -638,9 +638,12 @@ def open_segy(path: Path, request: Request) -> Source:
             told = stored.read(3600)[3200:]
         order = SEGY_ORDER.get(told[96:100], "big")
         kind = int.from_bytes(told[24:26], "little" if order == "little" else "big")
+        if len(told) < 400:
+            raise InputError("it is shorter than its header of 3600 bytes; it is cut")
         if order == "pairs" or kind not in SEGY_TYPES:
             raise InputError(f"its values are of type {kind} in the byte order {order}")
-        file = opened.enter_context(segyio.open(source, ignore_geometry=True, endian=order))
+        with refusing("it is cut or damaged"):
+            file = opened.enter_context(segyio.open(source, ignore_geometry=True, endian=order))
         found, close = _traces(path, file), opened.pop_all().close
     return file_source(path, found, stamp=stamp, close=close)
 

@@ -193,7 +193,7 @@ def _parted(line: str, separator: str) -> tuple[str, str]:
     """The key and the value of a line."""
     key, found, value = line.partition(separator)
     if not found:
-        raise InputError(f"its header has the line {line[:60]!r}")
+        raise InputError(f"its header has the line {line[:60]!r}, which is cut or no field")
     return key.strip(), value.strip()
 
 
@@ -594,7 +594,7 @@ def open_npy(path: Path, request: Request) -> Source:
             f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
             f" numpy.load('{path.name}')[NAME])"
         )
-    with refusing(f"{source} cannot be read as .npy"):
+    with refusing(f"{source} cannot be read as .npy: it is cut, or damaged"):
         # opened as a map for its header only: type, shape, order and the offset of the values;
         # Python objects are refused by it
         header = np.load(path, mmap_mode="r", allow_pickle=False)

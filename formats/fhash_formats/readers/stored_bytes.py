@@ -320,7 +320,7 @@ def numbers_in_text(
             values[found : found + len(words)] = numbers_of_words(words, dtype)
         found += len(words)
     if found != count or rest:  # a rest is that of a file which was cut meanwhile
-        raise InputError(f"it holds {found} numbers, {count} are needed")
+        raise InputError(f"it holds {found} numbers, {count} are needed; it is cut or no such grid")
     return values
 
 

@@ -19,13 +19,13 @@ from functools import partial
 from logging.handlers import BufferingHandler
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.file_series import Request, Stamp, condense, library, naming
+from fhash_formats.readers.file_series import Request, Stamp, condense, library, naming, refusing
 from fhash_formats.readers.stored_bytes import MAX_LINE, FlatArray, lattice
 from fhash_formats.readers.stored_parts import StoredParts
 from fhash_formats.readers.variables import (
@@ -86,13 +86,25 @@ def open_tiff(path: Path, request: Request) -> Source:
     """
     source, stamp = str(path), Stamp.of(path)
     tifffile = library(source, "TIFF", "tifffile", "fhash[formats]")
-    with naming(source), ExitStack() as opened:
+    with naming(source), refusing("it is cut or damaged"), ExitStack() as opened:
         with _strictly():
+            _require_pages(path)
             # the metadata of OME name further files
             file = tifffile.TiffFile(path, _multifile=False if request.no_external else None)
             found = _variables(path, opened.enter_context(file))
         close = opened.pop_all().close
     return file_source(path, found, stamp=stamp, close=close)
+
+
+def _require_pages(path: Path) -> None:
+    """Raise InputError where the first page is described behind the end of the file."""
+    with path.open("rb") as file:
+        head = file.read(16)
+    order: Literal["little", "big"] = "little" if head[:2] == b"II" else "big"
+    place = head[8:16] if head[:4] in MAGIC[2:] else head[4:8]
+    first, size = int.from_bytes(place, order), path.stat().st_size
+    if head[:4] in MAGIC and not 8 <= first < size:
+        raise InputError(f"it is cut: its pages are listed at byte {first}, it has {size}")
 
 
 def _variables(path: Path, file: Any) -> list[Variable]:

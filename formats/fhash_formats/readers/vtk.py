@@ -17,7 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming, require_length
+from fhash_formats.readers.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    naming,
+    refusing,
+    require_length,
+)
 from fhash_formats.readers.hdf5 import is_hdf5, open_hdf5
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.select import open_selected
@@ -570,7 +577,8 @@ def _entries(path: Path) -> list[Entry]:
     if path.suffix.lower() == ".series":
         if path.stat().st_size > MAX_LIST:
             raise InputError(f"it is larger than {MAX_LIST} bytes")
-        told = json.loads(path.read_text(encoding="utf-8"))
+        with refusing("it is cut, or no JSON"):
+            told = json.loads(path.read_text(encoding="utf-8"))
         rows = told.get("files") if isinstance(told, dict) else None
         if not isinstance(rows, list) or not all(
             isinstance(row, dict) and isinstance(row.get("name"), str) for row in rows

@@ -75,7 +75,10 @@ def nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
 
     The place is the top, or the one folder that was zipped.
     """
-    with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
+    with (
+        refusing(f"{source} cannot be read as a ZIP, it is cut or damaged"),
+        zipfile.ZipFile(path) as file,
+    ):
         names = file.namelist()
         for each in file.infolist():
             if each.filename.endswith(METADATA) and each.file_size > MAX_HEADER:
