@@ -257,7 +257,7 @@ def open_mrc(path: Path, request: Request) -> Source:
     with naming(source):
         head, packed = _head(path, 1024)
         if len(head) < 1024:
-            raise InputError("it is shorter than its header of 1024 bytes")
+            raise InputError("it is cut: it is shorter than its header of 1024 bytes")
         order = ">" if head[212:213] == b"\x11" else "<"
         words = np.frombuffer(head[:1024], f"{order}i4")
         floats = np.frombuffer(head[:1024], f"{order}f4").astype(np.float64)

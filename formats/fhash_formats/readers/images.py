@@ -267,6 +267,9 @@ def read_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
             if ALIASES.get(key) == "data file" and value.split()[:1] == ["LIST"]:
                 fields["list"] = decoded_text(header.file.read(MAX_HEADER))
                 break
+        else:
+            if "data file" not in fields:
+                raise InputError("its header has no empty line at its end; it is cut")
         packed = ENCODINGS.get(fields.get("encoding", "").lower()) in KINDS
         if packed and whole(fields, "byte skip"):
             raise InputError("it skips decompressed bytes, which is not supported")

@@ -329,7 +329,10 @@ def numbers_of_words(words: Sequence[bytes], dtype: np.dtype[Any]) -> npt.NDArra
     if max(map(len, words), default=0) > LONGEST_NUMBER:
         raise ValueError("text stands where numbers are needed")
     if dtype.kind == "f":
-        return np.array(words, dtype=f"S{LONGEST_NUMBER}").astype(dtype)
+        try:
+            return np.array(words, dtype=f"S{LONGEST_NUMBER}").astype(dtype)
+        except ValueError as error:
+            raise ValueError(f"{error}; it is cut, or has text in place of numbers") from error
     limits, numbers = np.iinfo(dtype), [int(word) for word in words]
     if numbers and not limits.min <= min(numbers) <= max(numbers) <= limits.max:
         raise ValueError(f"a number is beyond the type {dtype.name}")
