@@ -237,8 +237,12 @@ MRC_TYPES = {0: "i1", 1: "i2", 2: "f4", 4: "c8", 6: "u2", 12: "f2"}
 
 IMOD_STAMP = 1146047817
 """Word 39 of the header of a file by IMOD, whose word 40 has flags."""
-IMOD_SIGNED, IMOD_INVERTED, IMOD_HALF_BYTES = 1, 4, 16
-"""Flags of IMOD: bytes are signed, the origin is that of MRC2014, a byte holds two values."""
+IMOD_SIGNED = 1
+"""Flag of IMOD: bytes are signed."""
+IMOD_INVERTED = 4
+"""Flag of IMOD: the origin is that of MRC2014."""
+IMOD_HALF_BYTES = 16
+"""Flag of IMOD: a byte holds two values."""
 VOLUME_STACK = 401
 """First number of a space group that stands for volumes behind each other (MRC2014)."""
 
@@ -612,8 +616,10 @@ def _whole(array: FlatArray) -> npt.NDArray[np.float64]:
 SEGY_SUFFIXES = (".sgy", ".segy")
 LINES = {"inline": 189, "crossline": 193}
 """Bytes of the numbers of lines in the header of a trace (SEG-Y revision 1)."""
-TRACE_KIND, DEAD = 29, (2, 3)
-"""Byte of what a trace is, and its codes for traces without values: dead ones and dummies."""
+TRACE_KIND = 29
+"""Byte of the code of a trace's kind in its header."""
+DEAD = (2, 3)
+"""Codes of traces without values: dead ones and dummies."""
 SEGY_ORDER = {b"\4\3\2\1": "little", b"\3\4\1\2": "pairs"}
 """Byte orders other than big by the number 16909060 at byte 3297 (SEG-Y revision 2)."""
 SEGY_TYPES = (1, 2, 3, 5, 6, 8, 9, 10, 11, 12, 16)

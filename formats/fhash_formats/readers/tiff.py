@@ -147,10 +147,12 @@ NO_DATA = 42113
 ROLES = {"scale": "scale_factor", "offset": "add_offset", "unittype": "units"}
 """Attributes for the roles of items in GDAL's metadata."""
 ITEM = re.compile(r'<Item name="[^"<>]*" sample="0" role="(\w{1,20})">([^<>]{1,80})</Item>')
-LINE, NO_FUNCTION = 0, 20
-"""Functions of ImageJ's calibration: a line c0 + c1 * count, and none."""
+LINE = 0
+"""Function of ImageJ's calibration that is a line c0 + c1 * count."""
+NO_FUNCTION = 20
+"""Code of ImageJ's calibration for none; those between are curves."""
 SHOWN = {0: "0 is white in its pictures", 3: "its pictures have a palette of colours"}
-"""What the code of PhotometricInterpretation says that numbers alone do not."""
+"""Remarks by the code of PhotometricInterpretation, of what numbers alone do not tell."""
 
 
 def _meant(source: str, file: Any, whole: Variable) -> Variable:

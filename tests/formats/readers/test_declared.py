@@ -1,4 +1,4 @@
-"""What formats declare of their numbers holds: hidden places, signs, valid ranges, dates."""
+"""Declarations of formats on their numbers hold: hidden places, signs, valid ranges, dates."""
 
 from __future__ import annotations
 
