@@ -351,6 +351,7 @@ class SpanScan:
     Another machine may make it. Attributes:
         has_missing: whether a value is missing; nothing else counts then.
         ranks: of the values.
+        outside: number of values outside the range that the source calls valid.
     """
 
     def __init__(self, series: Series, steps: range) -> None:
@@ -358,7 +359,9 @@ class SpanScan:
         self._figures = _Figures(series)
         self.ranks = RanksSpan(steps.start * prod(series.shape[1:]))
         self.has_missing = False
+        self.outside = 0
         for _, frames in series.blocks(steps):
+            self.outside += series.outside(frames)
             if self._figures.add(frames) < frames.size:
                 self.has_missing, self.ranks = True, RanksSpan(0)
                 return
@@ -370,12 +373,14 @@ class SpanScan:
 
         None where a value is missing. Raises InputError as `scan` does.
         """
-        figures, ranks = _Figures(series), Ranks()
+        figures, ranks, outside = _Figures(series), Ranks(), 0
         for span in spans:
             if span.has_missing:
                 return None
+            outside += span.outside
             figures.join(span._figures)
             ranks.extend(span.ranks)
+        warn_outside(series, outside)
         return figures.scan(series, {}), ranks
 
 

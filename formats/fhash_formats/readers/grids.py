@@ -518,10 +518,11 @@ class _LegacyReader:
                 )
             while words := self._words():
                 self._take(words)
-        told = title.replace(":", "=").partition("time")[2].partition("=")
-        if self.time is None and told[1] and not told[0].strip() and told[2].split():
-            number = told[2].split()[0]
-            self.time = float(number) if is_number(number) else None
+        for part in title.replace(":", "=").split("time")[1:] if self.time is None else ():
+            before, _, rest = part.partition("=")
+            word = [*rest.replace(",", " ").split(), ""][0]
+            if not before.strip() and is_number(word):
+                self.time = float(word)
         if min(self.sizes) < 1:
             raise InputError(f"its dimensions are {self.sizes}")
 

@@ -170,7 +170,8 @@ def _meant(source: str, file: Any, whole: Variable) -> Variable:
         if role == "unittype" or (role in ROLES and is_number(text)):
             found[ROLES[role]] = text if role == "unittype" else np.float64(text)
     told: Mapping[str, Any] = (file.imagej_metadata or {}) if file.is_imagej else {}
-    remarks = [SHOWN[int(page.photometric)]] if int(page.photometric) in SHOWN else []
+    shown = page.tags.get("PhotometricInterpretation")
+    remarks = [] if shown is None or int(shown.value) not in SHOWN else [SHOWN[int(shown.value)]]
     orientation = page.tags.get("Orientation")
     if orientation is not None and int(orientation.value) != 1:
         remarks.append(f"its pictures are turned or mirrored (Orientation {orientation.value})")
