@@ -53,6 +53,7 @@ hard: .venv/.torch .venv/.clang
 	rm -f build/hard/figures.jsonl
 	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD) -m "" tests/fresh tests/golden tests/hard
 	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
+	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/readers.py --seconds 600 --keep build/hard/sources
 	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
 	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md
 

@@ -22,7 +22,7 @@ from typing import Any, cast
 import click
 
 from fhash_cli.output import describe_error, error_object, print_json, printed, say, warn
-from fhash_formats.errors import InterruptedEncodingError, MissingDependencyError
+from fhash_formats.errors import FhashWarning, InterruptedEncodingError, MissingDependencyError
 
 COMMANDS = {
     "encode": "fit a series and write it as RUN.fhz",
@@ -93,6 +93,7 @@ class Program(click.Group):
         _keep_freed_memory()
         with warnings.catch_warnings():
             warnings.showwarning = warn
+            _show_own_warnings()
             try:
                 return super().invoke(context)
             except KeyboardInterrupt:
@@ -120,6 +121,17 @@ class Program(click.Group):
             sys.exit(code)
         # click returns the exit code of commands that end early (--help, --version), else None.
         sys.exit(result if isinstance(result, int) else 0)
+
+
+def _show_own_warnings() -> None:
+    """Let no filter for other libraries, as PYTHONWARNINGS=ignore, hide the lines of a command."""
+    actions = [
+        action
+        for action, message, kind, module, _ in warnings.filters
+        if issubclass(FhashWarning, kind) and message is None and module is None
+    ]
+    if actions[:1] == ["ignore"]:
+        warnings.simplefilter("default", FhashWarning)
 
 
 def _of_distribution(name: str) -> click.Command:

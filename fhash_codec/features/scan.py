@@ -16,7 +16,7 @@ from fhash_codec.measure.errors import row_sums
 from fhash_codec.measure.value_range import PIECE, Mean, Ranks, RanksSpan, ValueRange, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
-from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults
+from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults, warn_outside
 from fhash_formats.support.threads import map_ahead, one_ahead, thread_pool
 from fhash_formats.support.values import Values, exact_number
 
@@ -277,17 +277,19 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     kept = series.held is None and size <= HELD_BYTES
     held = np.empty(series.shape, series.dtype) if kept else None
 
-    def look(at: tuple[range, Values]) -> tuple[range, Values, _Figures, int]:
+    def look(at: tuple[range, Values]) -> tuple[range, Values, _Figures, int, int]:
         block, frames = at
         if held is not None:
             held[block.start : block.stop] = frames
         own = _Figures(series)
-        return block, frames, own, own.add(frames)
+        return block, frames, own, own.add(frames), series.outside(frames)
 
+    outside = 0
     with thread_pool() as workers:
         blocks = one_ahead(series.blocks(range(steps)))
         looks = map_ahead(workers, look, blocks, BLOCKS_AHEAD)
-        for block, frames, own, finite in looks:
+        for block, frames, own, finite, beyond in looks:
+            outside += beyond
             figures.join(own)
             if finite < frames.size:
                 _add_missing(missing, block, frames)
@@ -305,6 +307,7 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
         )
     found = figures.scan(series, missing)
     warn_defaults(series)
+    warn_outside(series, outside)
     return found
 
 
@@ -348,6 +351,7 @@ class SpanScan:
     Another machine may make it. Attributes:
         has_missing: whether a value is missing; nothing else counts then.
         ranks: of the values.
+        outside: number of values outside the range that the source calls valid.
     """
 
     def __init__(self, series: Series, steps: range) -> None:
@@ -355,7 +359,9 @@ class SpanScan:
         self._figures = _Figures(series)
         self.ranks = RanksSpan(steps.start * prod(series.shape[1:]))
         self.has_missing = False
+        self.outside = 0
         for _, frames in series.blocks(steps):
+            self.outside += series.outside(frames)
             if self._figures.add(frames) < frames.size:
                 self.has_missing, self.ranks = True, RanksSpan(0)
                 return
@@ -367,12 +373,14 @@ class SpanScan:
 
         None where a value is missing. Raises InputError as `scan` does.
         """
-        figures, ranks = _Figures(series), Ranks()
+        figures, ranks, outside = _Figures(series), Ranks(), 0
         for span in spans:
             if span.has_missing:
                 return None
+            outside += span.outside
             figures.join(span._figures)
             ranks.extend(span.ranks)
+        warn_outside(series, outside)
         return figures.scan(series, {}), ranks
 
 

@@ -402,6 +402,7 @@ class Series(ABC):
         lazy: the array of dask (t, z, y, x) that the frames are computed from, if they are.
         defaults: default fill values of the format that were met in the frames read so far, of an
             array that declares no other. Among floats they are missing.
+        valid: least and greatest valid value that the source declares. Values outside are data.
     """
 
     source: str
@@ -422,6 +423,7 @@ class Series(ABC):
     held: npt.NDArray[Any] | None = None
     lazy: Any = None
     defaults: AbstractSet[float] = frozenset()
+    valid: tuple[Any, Any] | None = None
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
     @property
@@ -495,6 +497,16 @@ class Series(ABC):
         self.occurring = series.occurring
         self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
         self.not_stored, self.defaults = series.not_stored, series.defaults
+        self.valid = series.valid
+
+    def outside(self, frames: npt.NDArray[Any]) -> int:
+        """Number of values in frames that are outside the range which the source calls valid."""
+        if self.valid is None:
+            return 0
+        low, high = self.valid
+        if frames.dtype.kind == "f":
+            low, high = (frames.dtype.type(end) for end in self.valid)
+        return int(np.count_nonzero(frames < low) + np.count_nonzero(frames > high))
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
@@ -551,6 +563,20 @@ def warn_defaults(series: Series) -> None:
         else:
             what += f"it is kept as a number; --missing {value} takes it for a missing value"
         warnings.warn(what, FhashWarning, stacklevel=3)
+
+
+def warn_outside(series: Series, count: int) -> None:
+    """Warn (FhashWarning) of values outside the range that the source calls valid, in one line."""
+    if count and series.valid is not None:
+        low, high = (f"{end:.9g}" for end in series.valid)
+        warnings.warn(
+            f"{series.source}: {100 * count / math.prod(series.shape):.3g} % of the values of"
+            f" '{series.name}' ({count}) are outside the valid range {low} to {high} that it"
+            " declares, which CF takes for missing; they are kept as data, --missing takes a number"
+            " for a missing value",
+            FhashWarning,
+            stacklevel=3,
+        )
 
 
 def empty_selection(steps: int) -> str:

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import click
@@ -147,6 +148,7 @@ SIGNALS = ("SIGTERM", "SIGHUP", "SIGINT")
 
 SLOW_DISK = """
 import sys
+import warnings
 from fhash_cli import main
 if sys.argv[1] == "decode":
     from fhash_codec.volume import Volume as Slow
@@ -268,3 +270,13 @@ def test_closed_streams_do_not_end_up_in_outputs(run: Path, tmp_path: Path) -> N
         done = closed(["decode", run, "-o", tmp_path / f"{number}.npy"], streams)
         assert done.returncode == (0 if number == 0 else 1)
         assert np.load(tmp_path / f"{number}.npy").shape == (3, 6, 7, 8)
+
+
+def test_no_filter_of_warnings_hides_lines_of_a_command(fhash: Fhash, tmp_path: Path) -> None:
+    values = np.arange(24, dtype="f4").reshape(1, 2, 3, 4)
+    data = xr.Dataset({"v": (("time", "z", "y", "x"), values, {"valid_max": np.float32(20)})})
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        done = fhash("encode", tmp_path / "a.nc", "-o", tmp_path / "a.fhz", "--max-error", "0.1")
+    assert "12.5 % of the values of 'v' (3) are outside the valid range" in done.stderr

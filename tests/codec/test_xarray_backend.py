@@ -508,7 +508,7 @@ def packed_part(number: int, **encoding: Any) -> xr.Dataset:
     step, middle = (values.max() - values.min()) / 65000, (values.max() + values.min()) / 2
     days = ("time", 2.0 * number + np.arange(2), {"units": "days since 2000-01-01"})
     data = xr.Dataset(
-        {"t2m": (("time", "z", "y", "x"), values, {"units": "K", "valid_min": np.int16(-32000)})},
+        {"t2m": (("time", "z", "y", "x"), values, {"units": "K", "valid_min": np.int16(-32600)})},
         {"time": days},
     )
     packing = {"dtype": "int16", "scale_factor": step, "add_offset": middle, "_FillValue": -32767}

@@ -21,6 +21,9 @@ there is nothing to show (exit code 2).""",
 Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers:
 decoders, encoders (whose output must decode to the input), transforms, heads and their training,
 figures of quality, points of networks, the marcher, its light and its shading.""",
+    "mutated sources": """\
+Mutated files of the formats that this project reads itself, each read under limits of 5 seconds and
+2 GiB: read, or refused by one line.""",
     "kill -9 at an operation": """\
 The process is killed before each of its file operations. The older output stays complete, and the
 next run removes temporary files.""",

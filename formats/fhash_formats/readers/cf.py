@@ -33,12 +33,18 @@ from fhash_formats.support.dates import (
     UNITS,
     clock,
     in_days,
+    is_numeric_date,
     of_texts,
 )
 from fhash_formats.support.values import STORED, json_attributes, text_of
 
 SCALING = frozenset(("scale_factor", "add_offset"))
 """Attributes that make stored numbers counts of another unit."""
+
+OTHER_FILLS = frozenset(("fillvalue", "missingvalue", "codemissingvalue", "nodata", "nodatavalue"))
+OTHER_SCALES = {"scalefactor": 1, "slope": 1, "scale": 1, "offset": 0, "intercept": 0}
+"""Other names of fill values, and of a scale and an offset with what changes nothing, as files of
+HDF-EOS, GPM and MODIS have them: in lower case, without "_"."""
 
 AS_STORED = "; --raw-values reads the numbers as they are stored"
 """Advice where attributes make no sense."""
@@ -81,12 +87,18 @@ class Packing:
 
 
 def packing(
-    source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fill_value: Any = None
+    source: str,
+    dtype: np.dtype[Any],
+    attributes: Mapping[str, Any],
+    fill_value: Any = None,
+    *,
+    gaps: bool = False,
 ) -> Packing:
     """The packing that an array's attributes describe.
 
     attributes: JSON values, or as h5py gives them. fill_value: a further fill value, from zarr's
-    own metadata. Raises InputError for an attribute that is not a number.
+    own metadata. gaps: whether values may be missing for which no number stands. Raises InputError
+    for an attribute that is not a number.
     """
     stored = dtype.newbyteorder("=")
     told = text_of(_single(attributes.get("_Unsigned", ""))).lower()
@@ -97,6 +109,11 @@ def packing(
     values: list[Any] = []
     for value in (fill_value, attributes.get("_FillValue"), attributes.get("missing_value")):
         values += value if isinstance(value, list | tuple | np.ndarray) else [value]
+    for name in attributes:
+        if _bare(name) in OTHER_FILLS and name not in ("_FillValue", "missing_value"):
+            listed = np.ravel(attributes[name])[:MAX_FILLS].tolist()
+            numbers = [number_of_text(text_of(each)) for each in listed]
+            values += [each for each in numbers if each is not None and each == each]
     unsigned = other and stored.kind == "i"
     fills = [_fill(source, each, stored, unsigned=unsigned) for each in values if each is not None]
     scale, offset = (_single(attributes.get(name)) for name in ("scale_factor", "add_offset"))
@@ -106,7 +123,59 @@ def packing(
         _number(source, "scale_factor", scale),
         _number(source, "add_offset", offset),
         _scaled_type(stored, scale, offset),
+        gaps=gaps,
     )
+
+
+MAX_FILLS = 16
+"""Fill values of one attribute."""
+
+
+def _bare(name: str) -> str:
+    """The name of an attribute in lower case without "_"."""
+    return name.replace("_", "").lower()
+
+
+def unapplied(attributes: Mapping[str, Any]) -> str:
+    """Attributes that may scale the values, and follow no convention; "" without any."""
+    found = []
+    for name in attributes:
+        value = _single(attributes[name])
+        known = _bare(name) in OTHER_SCALES and name not in SCALING
+        number = isinstance(value, int | float | np.integer | np.floating)
+        if known and number and value != OTHER_SCALES[_bare(name)]:
+            found.append(f"{name} = {value:.9g}")
+    return ", ".join(found)
+
+
+def valid_limits(packed: Packing, attributes: Mapping[str, Any]) -> tuple[Any, Any] | None:
+    """The least and the greatest valid value in the units of unpacked ones; None without any.
+
+    CF 1.11, section 2.5.1: they count packed numbers, unless they are floats and those are not.
+    Attributes that are no numbers say nothing.
+    """
+    told = np.ravel(attributes.get("valid_range", ()))
+    given = told if told.size == 2 else [attributes.get(f"valid_{end}") for end in ("min", "max")]
+    ends: list[Any] = [-math.inf, math.inf]
+    for place, each in enumerate(map(_single, given)):
+        if not isinstance(each, int | float | np.integer | np.floating) or each != each:
+            continue
+        integers, whole = packed.stored.kind in "iu", isinstance(each, int | np.integer)
+        if packed.scaled and (whole or not integers):
+            limits = np.iinfo(packed.stored) if integers else None
+            if limits is not None:  # those of _Unsigned numbers may be written signed
+                each = int(each) % (1 << limits.bits) if limits.min == 0 else int(each)
+                each = min(max(each, int(limits.min)), int(limits.max))
+            stored = np.array([each], packed.stored)
+            each = replace(packed, fills=()).unpack(stored)[0]
+        elif integers and whole and packed.stored.kind == "u" and each < 0:
+            each = int(each) + (1 << 8 * packed.stored.itemsize)
+        ends[place] = each.item() if isinstance(each, np.generic) else each
+    if ends == [-math.inf, math.inf]:
+        return None
+    turned = packed.scaled and (1.0 if packed.scale is None else packed.scale) < 0
+    low, high = ends[::-1] if turned and told.size == 2 else ends
+    return (low, high)
 
 
 def note_packing(series: Series, packed: Packing) -> None:
@@ -135,13 +204,15 @@ def _packing(
     scale: float | None = None,
     offset: float | None = None,
     scaled: np.dtype[Any] | None = None,
+    *,
+    gaps: bool = False,
 ) -> Packing:
     """A packing without fills that are nowhere (None), or mark themselves (NaN)."""
     kept = tuple(fill for fill in fills if fill is not None and fill == fill)
     dtype = stored
     if scaled is not None and (scale is not None or offset is not None):
         dtype = scaled
-    elif kept and stored.kind in "iu":
+    elif (kept or gaps) and stored.kind in "iu":
         dtype = np.dtype(np.float32 if stored.itemsize <= 2 else np.float64)
     return Packing(stored=stored, dtype=dtype, fills=kept, scale=scale, offset=offset)
 
@@ -257,6 +328,8 @@ def role_of_coordinate(name: str, attributes: Mapping[str, Any]) -> str | None:
     axis = str(attributes.get("axis", "")).lower()
     if axis in AXES:
         return axis
+    if is_numeric_date(str(attributes.get("units", ""))):
+        return "t"
     for key, patterns in AXIS_PATTERNS.items():
         text = str(attributes.get(key, "")).strip().lower()
         for role, pattern in patterns.items():
@@ -300,6 +373,8 @@ def is_time(name: str, attributes: Mapping[str, Any], dtype: np.dtype[Any]) -> b
     units = str(attributes.get("units", "")).strip()
     if dtype.kind == "M" or SINCE.fullmatch(units) or units.lower() in UNITS:
         return True
+    if is_numeric_date(units):
+        return True
     name = str(attributes.get("standard_name", "")).strip().lower()
     return name in ("time", "forecast_period", "forecast_reference_time")
 
@@ -335,7 +410,8 @@ def real_time(named: Column | None, others: Iterable[Column]) -> Column | None:
 def _rank(column: Column) -> int | None:
     """Place among coordinates of time, the first is best; None for one that is no time."""
     name, attributes, dtype = column.described
-    if dtype.kind == "M" or SINCE.fullmatch(str(attributes.get("units", ""))):
+    units = str(attributes.get("units", ""))
+    if dtype.kind == "M" or SINCE.fullmatch(units) or is_numeric_date(units):
         # the start of a forecast is the same for all of its steps
         return 3 if attributes.get("standard_name") == "forecast_reference_time" else 0
     known = name.lower() in NAMES["t"].split() or role_of_coordinate(name, attributes) == "t"
@@ -347,9 +423,9 @@ def _rank(column: Column) -> int | None:
 def settled(coordinate: Coordinate) -> tuple[Coordinate, str]:
     """The times that stand for those of a file, and what is to be said of it, "" where nothing is.
 
-    Months, years and weeks are counted anew in days. Where a time is missing, the numbers of the
-    steps stand for all. Units that name no date are no `units` any more, since programs that decode
-    CF refuse them; the numbers stay.
+    Months, years, weeks and dates written as numbers are counted anew in days. Where a time is
+    missing, the numbers of the steps stand for all. Units that name no date are no `units` any
+    more, since programs that decode CF refuse them; the numbers stay.
     """
     name, attributes = coordinate.name, coordinate.attributes
     missing = np.flatnonzero(~np.isfinite(coordinate.values))
@@ -434,7 +510,9 @@ def _decodable(attributes: Mapping[str, Any]) -> bool:
     """Whether programs that decode CF make dates of a coordinate, or take it as numbers."""
     unit, known = _unit(attributes), clock(attributes) is not None
     calendar = str(attributes.get("calendar") or "standard").strip().lower()
-    return known == bool(unit) and not unit.startswith("week") and calendar != "360"
+    anew = unit.startswith(("week", "common_year")) or calendar == "360"
+    anew = anew or is_numeric_date(str(attributes.get("units", "")))
+    return known == bool(unit) and not anew
 
 
 def _undated(attributes: Mapping[str, Any]) -> dict[str, Any]:

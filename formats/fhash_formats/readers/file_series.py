@@ -17,7 +17,12 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import FhashError, InputError, MissingDependencyError
+from fhash_formats.errors import (
+    FhashError,
+    InputError,
+    MissingDependencyError,
+    MissingInputError,
+)
 from fhash_formats.readers.cf import Packing, missing_values, note_packing, settled
 from fhash_formats.series import (
     AXES,
@@ -176,6 +181,16 @@ class Request:
             for file in files:
                 inside_folder(path, file)
 
+    def beside(self, path: Path, file: Path) -> Path:
+        """A file that another one names: no reader opens such a file in another way.
+
+        Raises InputError for one that may not be read, and MissingInputError where it is not there.
+        """
+        self.require_inside(path, file)
+        if not file.is_file():
+            raise MissingInputError(f"{path} names {file}, which is not there")
+        return file
+
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was named for a format that has none."""
         if self.var is not None:
@@ -310,6 +325,16 @@ of several frames of 128^3 float64 are decompressed once, and memory stays small
 encoder's own.
 """
 
+MAX_AXIS = 1 << 24
+"""Positions along an axis of a file, which take 128 MiB."""
+
+
+def require_length(axis: str, count: int) -> None:
+    """Raise InputError for more positions along an axis than there can be."""
+    if count > MAX_AXIS:
+        raise InputError(f"it has {count} positions along {axis}; {MAX_AXIS} are possible")
+
+
 Fetch = Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
 
 
@@ -376,6 +401,8 @@ class FileSeries(Series):
         self.source, self.name, self.dtype = stored.source, plain_text(name), native(stored.dtype)
         self.files = () if stored.stamp is None else (Path(stored.source), *stored.beside)
         self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
+        for axis, length in zip(AXES, self.shape, strict=True):
+            require_length(axis, length)
         self.attributes = dict(attributes)
         self.units = str(self.attributes.get("units", ""))
         if "t" in coords:

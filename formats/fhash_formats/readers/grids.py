@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import takewhile
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -15,21 +16,26 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.file_series import Request, Stamp, library, naming
+from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming, refusing
 from fhash_formats.readers.stored_bytes import (
     GZIP,
+    LONGEST_NUMBER,
+    MAX_LINE,
     TYPES,
     CompressedFile,
     FlatArray,
+    Header,
     NumbersInText,
     PlainFile,
     StoredBytes,
     axis_steps,
+    count_of,
     lattice,
     numbers_of,
 )
 from fhash_formats.readers.variables import (
+    MAX_COMPONENTS,
     Source,
     Variable,
     by_ranges,
@@ -38,8 +44,9 @@ from fhash_formats.readers.variables import (
     placed,
     positions,
 )
+from fhash_formats.readers.vtk import without_hidden
 from fhash_formats.series import AXES, AXIS_NAMES
-from fhash_formats.support.values import decoded_text
+from fhash_formats.support.values import decoded_text, is_number
 
 HEAD_BYTES = 1 << 13
 """Stored bytes in which a compressed header is."""
@@ -114,7 +121,7 @@ def open_nifti(path: Path, request: Request) -> Source:
     """
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
-        data, packed = _head(path, 540)
+        data, packed = _head(path, 544)
         end: Literal["little", "big"] = (
             "little" if int.from_bytes(data[:4], "little") in (348, 540) else "big"
         )
@@ -123,7 +130,7 @@ def open_nifti(path: Path, request: Request) -> Source:
             raise InputError(f"its header says that it has {size} bytes; NIfTI has 348 or 540")
         form = [tuple(each.split(":")) for each in (NIFTI_1 if size == 348 else NIFTI_2).split()]
         if len(data) < size:
-            raise InputError(f"its header has {len(data)} bytes, {size} are needed")
+            raise InputError(f"its header has {len(data)} bytes, {size} are needed; it is cut")
         header = np.frombuffer(data, np.dtype(form).newbyteorder(end), count=1)[0]
         count = int(header["dim"][0])
         if not 1 <= count <= 7 or (header["dim"][1 : count + 1] < 1).any():
@@ -136,10 +143,10 @@ def open_nifti(path: Path, request: Request) -> Source:
             raise InputError(f"its values are of type {code}, no numbers")
         dtype = np.dtype(codes[codes.index(str(code)) + 1]).newbyteorder(end)
         pair = header["magic"][:2] == b"ni"
-        file = path.with_suffix(".img") if pair else path
-        if not file.is_file():
-            raise MissingInputError(f"its values are in {file}, which is not there")
-        offset = max(int(header["vox_offset"]), 0 if pair else size)
+        file = request.beside(path, _image_of(path)) if pair else path
+        packed = packed if file is path else _head(file, 0)[1]
+        # the header of a single file ends with four bytes that say whether extensions follow
+        offset = max(int(header["vox_offset"]), 0 if pair else size + 4)
         names = ["x", "y", "z", AXIS_NAMES["t"], "dim5", "dim6", "dim7"][: len(sizes)]
         whole, stored = _volume(file, packed, sizes, names, dtype, offset)
         whole = replace(whole, attributes=_nifti_attributes(header))
@@ -152,11 +159,24 @@ def open_nifti(path: Path, request: Request) -> Source:
     return file_source(path, found, stamp=stamp, files=files, close=stored.close)
 
 
+def _image_of(path: Path) -> Path:
+    """The file of the values that belong to a header of its own, compressed or not."""
+    plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path
+    image = plain.with_suffix(".img")
+    packed = image.with_suffix(".img.gz")
+    return packed if packed.is_file() and not image.is_file() else image
+
+
 def _nifti_attributes(header: Any) -> dict[str, Any]:
-    """Scale, offset and description of the values."""
+    """Scale, offset and description of the values.
+
+    A slope of 0, or none that is finite, stands for no scale (nifti1.h).
+    """
     slope, inter = float(header["scl_slope"]), float(header["scl_inter"])
     found: dict[str, Any] = {}
-    if np.isfinite([slope, inter]).all() and slope != 0 and (slope, inter) != (1, 0):
+    if np.isfinite(slope) and slope != 0 and (slope, inter) != (1, 0):
+        if not np.isfinite(inter):
+            raise InputError(f"its values have the slope {slope} and the offset {inter}")
         found = {"scale_factor": slope, "add_offset": inter}
     told = decoded_text(bytes(header["descrip"]).split(b"\0")[0]).strip()
     return found | ({"long_name": told} if told.isprintable() and told else {})
@@ -166,7 +186,7 @@ def _affine(header: Any) -> npt.NDArray[np.float64]:
     """The affine (3, 4) of the array: sform, else qform, else the spacings."""
     if header["sform_code"] > 0:
         return np.asarray(header["srow"], np.float64).reshape(3, 4)
-    step = np.asarray(header["pixdim"], np.float64)
+    step = np.array(header["pixdim"], np.float64)
     step[1:4] = np.where(step[1:4] > 0, step[1:4], 1.0)
     if header["qform_code"] <= 0:
         return np.hstack([np.diag(step[1:4]), np.zeros((3, 1))])
@@ -215,6 +235,17 @@ MRC_SUFFIXES = (".mrc", ".map", ".ccp4", ".rec", ".mrcs", ".st")
 MRC_TYPES = {0: "i1", 1: "i2", 2: "f4", 4: "c8", 6: "u2", 12: "f2"}
 """Number types by the mode (MRC2014)."""
 
+IMOD_STAMP = 1146047817
+"""Word 39 of the header of a file by IMOD, whose word 40 has flags."""
+IMOD_SIGNED = 1
+"""Flag of IMOD: bytes are signed."""
+IMOD_INVERTED = 4
+"""Flag of IMOD: the origin is that of MRC2014."""
+IMOD_HALF_BYTES = 16
+"""Flag of IMOD: a byte holds two values."""
+VOLUME_STACK = 401
+"""First number of a space group that stands for volumes behind each other (MRC2014)."""
+
 
 def is_mrc(head: bytes, path: Path) -> bool:
     """Whether this is MRC or CCP4, compressed or not, by the letters MAP at byte 208."""
@@ -230,18 +261,26 @@ def open_mrc(path: Path, request: Request) -> Source:
     with naming(source):
         head, packed = _head(path, 1024)
         if len(head) < 1024:
-            raise InputError("it is shorter than its header of 1024 bytes")
+            raise InputError("it is cut: it is shorter than its header of 1024 bytes")
         order = ">" if head[212:213] == b"\x11" else "<"
         words = np.frombuffer(head[:1024], f"{order}i4")
         floats = np.frombuffer(head[:1024], f"{order}f4").astype(np.float64)
         sizes, kind = [int(n) for n in words[:3]], MRC_TYPES.get(int(words[3]))
-        if kind is None or min(sizes) < 1 or words[23] < 0:
+        flags = int(words[39]) if words[38] == IMOD_STAMP else None
+        if kind is None or min(sizes) < 1 or words[23] < 0 or (flags or 0) & IMOD_HALF_BYTES:
             raise InputError(f"its sizes are {sizes} and its mode {int(words[3])}")
+        if kind == "i1" and not _has_signed_bytes(flags, floats[19], floats[20]):
+            kind = "u1"
         letters = ["xyz"[n - 1] if 1 <= n <= 3 else "?" for n in words[16:19].tolist()]
         if set(letters) != set("xyz"):
             letters = ["x", "y", "z"]  # of programs that leave them out
-        start = 1024 + int(words[23])
-        whole, stored = _volume(path, packed, sizes, letters, np.dtype(order + kind), start)
+        start, names, volumes = 1024 + int(words[23]), letters, int(words[9])
+        if words[22] >= VOLUME_STACK and 0 < volumes < sizes[2] and sizes[2] % volumes == 0:
+            sizes, names = [*sizes[:2], volumes, sizes[2] // volumes], [*letters, AXIS_NAMES["t"]]
+        whole, stored = _volume(path, packed, sizes, names, np.dtype(order + kind), start)
+        # before 2013, IMOD wrote the place of the origin of the axes, and not that of the grid
+        if flags is not None and not flags & IMOD_INVERTED and words[27] <= 0:
+            floats[49:52] *= -1
         coords = {}
         for n, axis in enumerate("xyz"):
             cells, cell = int(words[7 + n]), floats[10 + n]
@@ -254,61 +293,83 @@ def open_mrc(path: Path, request: Request) -> Source:
     return file_source(path, placed([whole], coords), stamp=stamp, close=stored.close)
 
 
+def _has_signed_bytes(flags: int | None, low: float, high: float) -> bool:
+    """Whether bytes of MRC are signed, as MRC2014 has them.
+
+    flags: of IMOD, None in other files. low, high: least and greatest value by the header, where
+    low is not above high; other programs than IMOD leave nothing else that tells.
+    """
+    return bool(flags & IMOD_SIGNED) if flags is not None else not (0 <= low <= high and high > 127)
+
+
 DX_SUFFIXES = (".dx",)
-MAX_DX_HEADER = 1 << 20
-"""Bytes of the longest header of OpenDX."""
 DX_TYPES = {"byte": "u1"} | {name: TYPES[name] for name in ("float", "double", "int", "short")}
-DX_NUMBER = r"[-+0-9.eE]+"
 
 
 def is_dx(head: bytes, path: Path) -> bool:
     """Whether this is OpenDX: its first object is a grid of positions."""
-    return re.match(rb"(\s*#[^\n]*\n|\s)*object\s+\S+\s+class\s+gridpositions", head) is not None
+    for line in head.split(b"\n"):
+        words = line.split()
+        if words and not words[0].startswith(b"#"):
+            return words[::2][:2] == [b"object", b"class"] and words[3:4] == [b"gridpositions"]
+    return False
 
 
 def open_dx(path: Path, request: Request) -> Source:
     """The values of an OpenDX grid (APBS, VMD, Chimera): z is the fastest, as text or as bytes.
 
-    Raises InputError for grids that are turned, and files that are cut.
+    Raises InputError for grids that are turned, values that are not behind the header or are no
+    numbers one by one, and files that are cut.
     """
-    source, stamp = str(path), Stamp.of(path)
-    with naming(source):
-        with path.open("rb") as file:
-            data = file.read(MAX_DX_HEADER)
-        text = decoded_text(data)
-        counts = re.search(r"class\s+gridpositions\s+counts\s+(\d+)\s+(\d+)\s+(\d+)", text)
-        array = re.search(
-            r"class\s+array\s+type\s+(\w+)[^\n]*?items\s+(\d+)([^\n]*?)data\s+follows[^\n]*\n", text
-        )
-        if counts is None or array is None or array[1].lower() not in DX_TYPES:
-            raise InputError("it holds no grid of positions with an array of numbers that follows")
-        sizes = [int(counts[n]) for n in (1, 2, 3)]
-        if prod(sizes) != int(array[2]) or not prod(sizes):
-            raise InputError(
-                f"its grid has {prod(sizes)} positions, and its array {array[2]} items"
-            )
-        header = text[: array.start()]
-        origin = _dx_numbers(header, "origin")[:1] or [[0.0, 0.0, 0.0]]
-        deltas = _dx_numbers(header, "delta") or np.eye(3).tolist()
+    stamp = Stamp.of(path)
+    with naming(str(path)), Header(path) as header:
+        words: list[str] = []
+        while "follows" not in (line := header.words()):
+            if not line:
+                raise InputError("it holds no array of numbers that follows; it is cut or no grid")
+            words += [] if line[0].startswith("#") else line
+        words += line
+        most = path.stat().st_size
+        first = words.index("array") if "array" in words else 0
+        sizes = [count_of(each, "positions", most, 1) for each in _behind(words, "counts", 3)]
+        told = words[first:]
+        items, kind = _behind(told, "items", 1), told[told.index("type") + 1 :]
+        signed = {"unsigned": "u", "signed": "i"}.get(kind[0], "")
+        short = DX_TYPES.get(kind[1 if signed else 0].lower(), "")
+        if not first or not short or prod(map(int, _behind(told, "shape", -1))) != 1:
+            raise InputError("it holds no array of numbers, one for each position")
+        if prod(sizes) != count_of(items[0], "items", most):
+            has = f"{prod(sizes)} positions, and its array {items[0]} items"
+            raise InputError(f"its grid has {has}")
+        grid = words[:first]
+        origin = numbers_of(" ".join(_behind(grid, "origin", 3) or "000"), 3)
+        places = [n for n, word in enumerate(grid) if word == "delta"]
+        deltas = [numbers_of(" ".join(grid[n + 1 : n + 4]), 3) for n in places] or [*np.eye(3)]
         if len(deltas) != 3:
             raise InputError(f"it has {len(deltas)} deltas, not 3")
         steps = axis_steps(np.array(deltas))
-        order = "<" if "lsb" in array[3] or "lsb" in array[1] else ">"
-        dtype = np.dtype(order + DX_TYPES[array[1].lower()])
-        with path.open("rb") as file:
-            file.seek(len(text[: array.end()].encode()))
-            is_text = re.search("binary|ieee", array[0]) is None
-            values = _values_at(path, file, tuple(sizes), dtype, is_text=is_text)
-        coords = {
-            axis: lattice(axis, origin[0][n], steps[n], sizes[n]) for n, axis in enumerate("xyz")
-        }
+        if signed and short[0] in "iu":
+            short = signed + short[1:]
+        dtype = np.dtype(("<" if "lsb" in told else ">") + short)
+        is_text = not {"binary", "ieee"} & {*told}
+        values = _values_at(path, header.file, tuple(sizes), dtype, is_text=is_text)
+        lines = zip(origin.tolist(), steps, sizes, strict=True)
+        coords = {axis: lattice(axis, *each) for axis, each in zip("xyz", lines, strict=True)}
     return file_source(path, placed([values.variable(path.stem, "xyz")], coords), stamp=stamp)
 
 
-def _dx_numbers(text: str, key: str) -> list[list[float]]:
-    """The three numbers of each line of a key."""
-    found = re.findall(rf"\b{key}\s+({DX_NUMBER}\s+{DX_NUMBER}\s+{DX_NUMBER})", text)
-    return [numbers_of(each, 3).tolist() for each in found]
+def _behind(words: Sequence[str], key: str, count: int) -> list[str]:
+    """The words behind a key, none without one that may be left out; -1: all that are numbers."""
+    if key not in words:
+        if key in ("origin", "shape"):
+            return []
+        raise InputError(f"it has no {key}")
+    found = words[words.index(key) + 1 :]
+    if count < 0:
+        return [*takewhile(str.isdecimal, (word[:18] for word in found))]
+    if len(found) < count:
+        raise InputError(f"{count} numbers do not follow {key}")
+    return list(found[:count])
 
 
 CUBE_SUFFIXES = (".cube", ".cub")
@@ -326,23 +387,30 @@ def open_cube(path: Path, request: Request) -> Source:
     that are turned, and files that are cut.
     """
     stamp = Stamp.of(path)
-    with naming(str(path)), path.open("rb") as file:
-        lines = [decoded_text(file.readline(MAX_LINE)).split() for _ in range(6)]
+    with naming(str(path)), Header(path) as header:
+        lines = [decoded_text(header.line()).split() for _ in range(6)]
         rows = np.stack([numbers_of(" ".join(each[:4]), 4) for each in lines[2:]])
         if not np.isfinite(rows).all() or not rows[1:, 0].all():
             raise InputError("its grid has numbers that are not finite, or no vertices")
-        sizes, steps = np.abs(rows[1:, 0]).astype(int).tolist(), axis_steps(rows[1:, 1:])
-        atoms = int(rows[0, 0])
-        orbitals = [str(n) for n in range(int(lines[2][4]) if len(lines[2]) > 4 else 1)]
-        for _ in range(min(abs(atoms), path.stat().st_size)):
-            file.readline(MAX_LINE)
+        most = path.stat().st_size
+        sizes = [abs(count_of(each[0], "vertices", most, -most)) for each in lines[3:]]
+        steps = axis_steps(rows[1:, 1:])
+        atoms = count_of(lines[2][0], "atoms", most, -most)
+        many = count_of([*lines[2], "1"][4], "values a vertex", MAX_COMPONENTS, 1)
+        orbitals = [str(n) for n in range(many)]
+        for _ in range(abs(atoms)):
+            if not header.line():
+                raise InputError(f"it is cut: it has fewer than {abs(atoms)} atoms")
         if atoms < 0:  # numbers of orbitals, and how many there are
-            words = file.readline(MAX_LINE).split()
-            while len(words) <= int(words[0]) and (line := file.readline(MAX_LINE)):
-                words += line.split()
-            orbitals = [decoded_text(each) for each in words[1:]]
+            words = header.words() or ["0"]
+            many = count_of(words[0], "orbitals", MAX_COMPONENTS, 1)
+            while len(words) <= many and (line := header.words()):
+                words += line
+            orbitals = words[1 : many + 1]
+            if len(orbitals) < many:
+                raise InputError(f"it is cut: it has fewer than {many} numbers of orbitals")
         shape = (*sizes, len(orbitals)) if len(orbitals) != 1 else tuple(sizes)
-        values = _values_at(path, file, shape, np.dtype(np.float64), is_text=True)
+        values = _values_at(path, header.file, shape, np.dtype(np.float64), is_text=True)
     unit = "bohr" if rows[1, 0] > 0 else "angstrom"
     coords = {
         axis: lattice(axis, rows[0, n + 1], steps[n], sizes[n], units=unit)
@@ -364,12 +432,12 @@ def _values_at(
     if not is_text:
         file.seek(start + size)
         return FlatArray(path, shape, dtype, stored=PlainFile(path, start=start, size=size))
-    stop = start
-    while line := file.readline():
-        first = line.split(maxsplit=1)[:1]
+    stop, begins = start, True  # whether a line begins here: lines may be long
+    while line := file.readline(MAX_LINE):
+        first = line[:LONGEST_NUMBER].split(maxsplit=1)[:1] if begins else []
         if first and first[0][:1].isalpha() and first[0].lower() not in (b"nan", b"inf"):
             break
-        stop = file.tell()
+        stop, begins = stop + len(line), line.endswith(b"\n")
     file.seek(stop)
     stored = NumbersInText(path, dtype, start=start, size=size, stop=stop)
     return FlatArray(path, shape, dtype, stored=stored)
@@ -381,7 +449,8 @@ LEGACY_TYPES |= {"char": "i1", "long": "i8", "unsigned_long": "u8"}
 LEGACY_TYPES |= {"vtktypeint64": "i8", "vtktypeuint64": "u8"}
 LEGACY_TIMES = ("TIME", "TimeValue")
 """Names of fields that hold the time: VisIt's and ParaView's."""
-MAX_LINE = 4096
+MAX_ARRAYS = 1 << 12
+"""Arrays of a file."""
 
 
 def is_legacy_vtk(head: bytes, path: Path) -> bool:
@@ -398,7 +467,7 @@ def open_legacy_vtk(path: Path, request: Request) -> Source:
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
         reader = _LegacyReader(path)
-        names = [name for _, name, _ in reader.arrays]
+        names = Counter(name for _, name, _ in reader.arrays)
         found: list[Variable] = []
         for section, cells in (("POINT_DATA", False), ("CELL_DATA", True)):
             space = tuple(max(n - 1, 1) if cells else n for n in reversed(reader.sizes))
@@ -408,10 +477,11 @@ def open_legacy_vtk(path: Path, request: Request) -> Source:
                 if count != prod(space):
                     told = f"the array {name} has {count} values, the grid {prod(space)}"
                     raise InputError(told)
-                full = f"{section}/{name}" if names.count(name) > 1 else name
+                full = f"{section}/{name}" if names[name] > 1 else name
                 whole = FlatArray(path, shape, array.dtype, stored=array.stored)
                 parts += components(whole.variable(full, AXES[1:]), len(space))
             coords = reader.coordinates(cells=cells) if parts else {}
+            parts = without_hidden(parts, "CellData" if cells else "PointData")
             found += placed(parts, coords, f"header/{section}")
     return file_source(path, found, stamp=stamp)
 
@@ -433,7 +503,8 @@ class _LegacyReader:
         self._lines: dict[str, npt.NDArray[np.float64]] = {}
         self._origin, self._spacing = np.zeros(3), np.ones(3)
         self._section, self._count = "", "0"
-        with path.open("rb") as self._file:
+        with Header(path) as self._header:
+            self._file = self._header.file
             self._file.readline(MAX_LINE)
             title = decoded_text(self._file.readline(MAX_LINE))
             self._text = self._words()[:1] == ["ASCII"]
@@ -447,9 +518,11 @@ class _LegacyReader:
                 )
             while words := self._words():
                 self._take(words)
-        match = re.search(r"time\s*[=:]\s*([-+0-9.eE]+)", title)
-        if self.time is None and match is not None:
-            self.time = float(numbers_of(match[1], 1)[0])
+        for part in title.replace(":", "=").split("time")[1:] if self.time is None else ():
+            before, _, rest = part.partition("=")
+            word = [*rest.replace(",", " ").split(), ""][0]
+            if not before.strip() and is_number(word):
+                self.time = float(word)
         if min(self.sizes) < 1:
             raise InputError(f"its dimensions are {self.sizes}")
 
@@ -481,7 +554,8 @@ class _LegacyReader:
         """Read what a line begins."""
         key, numbers = words[0].upper(), " ".join(words[1:4])
         if key == "DIMENSIONS":
-            x, y, z = map(int, numbers_of(numbers, 3))
+            sizes = [*words[1:4], "", "", ""][:3]
+            x, y, z = (count_of(each, "points", MAX_AXIS, 1) for each in sizes)
             self.sizes = (x, y, z)
         elif key == "ORIGIN":
             self._origin = numbers_of(numbers, 3)
@@ -492,7 +566,7 @@ class _LegacyReader:
         elif key in ("POINT_DATA", "CELL_DATA"):
             self._section, self._count = key, " ".join(words[1:2])
         elif key == "FIELD" and len(words) == 3:
-            self._fields(int(words[2]))
+            self._fields(count_of(words[2], "fields", MAX_ARRAYS))
         elif key == "METADATA":
             while self._file.readline(MAX_LINE).strip():
                 pass  # up to an empty line
@@ -506,7 +580,7 @@ class _LegacyReader:
         elif key == "LOOKUP_TABLE" and len(words) == 3:
             self._array("", words[2], "4", "float" if self._text else "unsigned_char")
         else:
-            raise InputError(f"it has the line {' '.join(words)[:60]!r}, which is not known")
+            raise InputError(f"it has the line {' '.join(words)[:60]!r}, which is cut or not known")
 
     def _fields(self, count: int) -> None:
         for _ in range(count):
@@ -522,11 +596,12 @@ class _LegacyReader:
 
     def _array(self, name: str, count: str, parts: str, kind: str) -> FlatArray:
         """An array whose values begin here, which is kept where it has a name and a section."""
-        short, shape = LEGACY_TYPES.get(kind.lower()), (int(count), int(parts))
+        short, most = LEGACY_TYPES.get(kind.lower()), self.path.stat().st_size
         if short is None:
             raise InputError(f"the array {name} is of type {kind}, no numbers")
-        if shape[0] < 0 or shape[1] < 1:
-            raise InputError(f"the array {name} has {count} values of {parts} parts")
+        shape = (count_of(count, "values", most), count_of(parts, "parts", MAX_COMPONENTS, 1))
+        if len(self.arrays) == MAX_ARRAYS:
+            raise InputError(f"it has more than {MAX_ARRAYS} arrays")
         dtype = np.dtype(f">{short}")
         array = _values_at(self.path, self._file, shape, dtype, is_text=self._text)
         if name and self._section:
@@ -542,6 +617,14 @@ def _whole(array: FlatArray) -> npt.NDArray[np.float64]:
 SEGY_SUFFIXES = (".sgy", ".segy")
 LINES = {"inline": 189, "crossline": 193}
 """Bytes of the numbers of lines in the header of a trace (SEG-Y revision 1)."""
+TRACE_KIND = 29
+"""Byte of the code of a trace's kind in its header."""
+DEAD = (2, 3)
+"""Codes of traces without values: dead ones and dummies."""
+SEGY_ORDER = {b"\4\3\2\1": "little", b"\3\4\1\2": "pairs"}
+"""Byte orders other than big by the number 16909060 at byte 3297 (SEG-Y revision 2)."""
+SEGY_TYPES = (1, 2, 3, 5, 6, 8, 9, 10, 11, 12, 16)
+"""Codes of number types that segyio knows; it takes others for IBM's floats."""
 
 
 def is_segy(head: bytes, path: Path) -> bool:
@@ -558,7 +641,16 @@ def open_segy(path: Path, request: Request) -> Source:
     source, stamp = str(path), Stamp.of(path)
     segyio = library(source, "SEG-Y", "segyio", "fhash[segy]")
     with naming(source), ExitStack() as opened:
-        file = opened.enter_context(segyio.open(source, ignore_geometry=True))
+        with path.open("rb") as stored:
+            told = stored.read(3600)[3200:]
+        order = SEGY_ORDER.get(told[96:100], "big")
+        kind = int.from_bytes(told[24:26], "little" if order == "little" else "big")
+        if len(told) < 400:
+            raise InputError("it is shorter than its header of 3600 bytes; it is cut")
+        if order == "pairs" or kind not in SEGY_TYPES:
+            raise InputError(f"its values are of type {kind} in the byte order {order}")
+        with refusing("it is cut or damaged"):
+            file = opened.enter_context(segyio.open(source, ignore_geometry=True, endian=order))
         found, close = _traces(path, file), opened.pop_all().close
     return file_source(path, found, stamp=stamp, close=close)
 
@@ -589,6 +681,12 @@ def _traces(path: Path, file: Any) -> list[Variable]:
         starts = [line * shape[1] for line in slow]
         return np.stack([raw[n + fast.start : n + fast.stop][:, kept] for n in starts])
 
+    dead = np.isin(file.attributes(TRACE_KIND)[:], DEAD).reshape(shape[:-1])
+
+    def hidden(places: tuple[slice | int, ...]) -> npt.NDArray[np.bool_]:
+        part = dead[places[:2]]
+        return part if isinstance(places[2], int) else part[..., None]
+
     axes = {"inline": "Y", "crossline": "X", "trace": "X", "sample": "Z"}
     whole = Variable(
         name=path.stem,
@@ -596,6 +694,7 @@ def _traces(path: Path, file: Any) -> list[Variable]:
         dtype=np.dtype(file.dtype),
         dimensions=tuple(columns),
         read=by_ranges(shape, get),
+        hidden=hidden if dead.any() else None,
     )
     units = {"sample": {"units": "ms", "positive": "down"}}
     coords = [

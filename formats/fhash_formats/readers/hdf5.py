@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
-from fhash_formats.readers.file_series import Request, Stamp, naming, refusing
+from fhash_formats.readers.file_series import Request, Stamp, naming, refusing, require_length
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.simulations import athena_variables, flash_variables, in_place_of
 from fhash_formats.readers.stored_bytes import lattice
-from fhash_formats.readers.stored_parts import Hdf5Sources
+from fhash_formats.readers.stored_parts import Hdf5Sources, hdf5_file
 from fhash_formats.readers.variables import (
     Behind,
     Source,
@@ -106,9 +106,7 @@ def says_netcdf(head: bytes, path: Path) -> bool:
         return False
     if path.suffix.lower() in NETCDF_SUFFIXES:
         return True
-    import h5py
-
-    with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:
+    with refusing(f"{path} cannot be read as HDF5"), hdf5_file(path) as file:
         conventions = text_of(file.attrs.get("Conventions", "")).strip().upper()
         return "_NCProperties" in file.attrs or conventions.startswith("CF-")
 
@@ -268,9 +266,7 @@ def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
     source, stamp = str(path), Stamp.of(path)
     kind = "NetCDF" if netcdf else "HDF5"
     with naming(source), refusing(f"{source} cannot be read as {kind}"):
-        import h5py
-
-        file = h5py.File(path, "r")
+        file = hdf5_file(path)
         try:
             tree = walk(file)
             variables = _Variables(path, tree, netcdf=netcdf).listed()
@@ -537,6 +533,8 @@ def openpmd_lines(
     spacing = _numbers(known.get("gridSpacing"), len(shape), 1.0)[::way]
     offset = _numbers(known.get("gridGlobalOffset"), len(shape), 0.0)[::way]
     place = _numbers(json_attributes(component).get("position"), len(shape), 0.0)[::way]
+    for label, length in zip(labels, shape, strict=True):
+        require_length(str(label), length)
     unit = known.get("gridUnitSI")
     scale = float(unit) if isinstance(unit, int | float) else 1.0
     return {
@@ -645,4 +643,7 @@ def _minc_scaled(
 
     one = np.unique(np.stack([slopes.ravel(), offsets.ravel()]), axis=1)
     told = {"scale_factor": one[0, 0], "add_offset": one[1, 0]} if one.shape[1] == 1 else {}
-    return replace(image, values=np.dtype(np.float64), read=read, handle=told)
+    attributes = {key: each for key, each in image.attributes.items() if key != "valid_range"}
+    return replace(
+        image, values=np.dtype(np.float64), read=read, handle=told, attributes=attributes
+    )

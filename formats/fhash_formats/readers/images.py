@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.cf import role_of_name
 from fhash_formats.readers.file_series import (
     ENDIANS,
@@ -25,9 +27,12 @@ from fhash_formats.readers.file_series import (
 )
 from fhash_formats.readers.stored_bytes import (
     KINDS,
+    MAX_HEADER,
+    MAX_LINE,
     TYPES,
     CompressedFile,
     FlatArray,
+    Header,
     ManyFiles,
     NumbersInText,
     PlainFile,
@@ -45,10 +50,7 @@ from fhash_formats.readers.variables import (
     positions,
 )
 from fhash_formats.series import AXES, AXIS_NAMES
-from fhash_formats.support.values import decoded_text
-
-MAX_HEADER = 64 * 2**20
-"""Bytes of the longest header; own ones list every coordinate."""
+from fhash_formats.support.values import decoded_text, is_number
 
 MAX_DIMENSIONS = 16
 """Dimensions of NRRD."""
@@ -80,14 +82,11 @@ def _opened(
         sizes, dimension = sizes_of(fields, "sizes"), fields.get("dimension", "")
         if dimension != str(len(sizes)) or len(sizes) > MAX_DIMENSIONS:
             raise InputError(f"it has {len(sizes)} sizes and the dimension {dimension!r}")
-        axes, dtype = _axes(fields, sizes), dtype_of(fields)
+        axes, dtype = _axes(fields, pairs, sizes), dtype_of(fields)
         size = prod(sizes) * dtype.itemsize
         files = []
         for name in _names(fields, prod(sizes)):
-            files.append(path.parent / name)
-            request.require_inside(path, files[-1])
-            if not files[-1].is_file():
-                raise MissingInputError(f"its values are in {files[-1]}, which is not there")
+            files.append(request.beside(path, path.parent / name))
         if files and size % len(files):
             raise InputError(f"its {size} bytes cannot be divided among {len(files)} files")
         parts = [_part(file, fields, dtype, 0, size // len(files)) for file in files]
@@ -95,15 +94,40 @@ def _opened(
             parts = [_part(path, fields, dtype, end, size)]
         stored = ManyFiles(parts) if len(parts) > 1 else parts[0]
         name = fields.get("content", "").strip('" ') or path.stem
-        units = fields.get("sample units", "").strip('" ')
         array = FlatArray(path, tuple(reversed(sizes)), dtype, stored=stored)
         whole = array.variable(name, [AXIS_NAMES.get(axis) for axis in reversed(axes)])
-        arrays = [replace(whole, attributes={"units": units} if units else {})]
+        arrays = [replace(whole, attributes=_meaning(str(path), fields, dtype))]
         if "" in axes:
             arrays = components(arrays[0], len(sizes) - 1 - axes.index(""))
         found = placed(arrays, _coordinates(fields, pairs, sizes, axes))
         others = list(dict.fromkeys(files))
     return file_source(path, found, stamp=stamp, files=others, close=stored.close)
+
+
+def _meaning(source: str, fields: Fields, dtype: np.dtype[Any]) -> dict[str, Any]:
+    """Units of the values, and the line that counts of MetaImage stand for.
+
+    Warns (FhashWarning) of NRRD's range before its values were quantised, which is not undone.
+    """
+    units = fields.get("sample units", "").strip('" ')
+    found: dict[str, Any] = {"units": units} if units else {}
+    slope, offset = (
+        numbers_of(fields.get(name, default), 1)[0]
+        for name, default in (("slope", "1"), ("offset", "0"))
+    )
+    if (slope, offset) != (1, 0):
+        if not np.isfinite([slope, offset]).all() or slope == 0:
+            raise InputError(f"its values have the slope {slope} and the offset {offset}")
+        found |= {"scale_factor": float(slope), "add_offset": float(offset)}
+    if dtype.kind in "iu" and {"oldmin", "oldmax"} <= fields.keys():
+        ends = f"{fields['oldmin'][:40]} to {fields['oldmax'][:40]}"
+        warnings.warn(
+            f"{source}: its values were quantised from {ends} (old min, old max); they are read as"
+            " the numbers that are stored",
+            FhashWarning,
+            stacklevel=2,
+        )
+    return found
 
 
 def _names(fields: Fields, most: int) -> Iterator[str]:
@@ -142,11 +166,10 @@ def _part(path: Path, fields: Fields, dtype: np.dtype[Any], start: int, size: in
         raise InputError(f"its encoding is {encoding!r}; raw, gzip, bzip2 and text can be read")
     kind, skip, lines = ENCODINGS[encoding], whole(fields, "byte skip"), whole(fields, "line skip")
     if lines > 0:
-        with path.open("rb") as file:
-            file.seek(start)
-            if not all(file.readline(MAX_HEADER) for _ in range(lines)):
+        with Header(path, start) as header:
+            if not all(header.line(MAX_HEADER) for _ in range(lines)):
                 raise InputError(f"{path} has fewer than the {lines} lines to skip")
-            start = file.tell()
+            start = header.file.tell()
     if skip < 0 and kind != "raw":
         raise InputError("bytes to skip that are -1 belong to raw values")
     start = path.stat().st_size - size if skip < 0 else start + skip
@@ -157,19 +180,20 @@ def _part(path: Path, fields: Fields, dtype: np.dtype[Any], start: int, size: in
     return PlainFile(path, start=start, size=size)
 
 
-def _lines(file: BinaryIO) -> Iterator[str]:
-    """The lines of a header."""
-    while line := file.readline(MAX_HEADER):
-        if file.tell() > MAX_HEADER:
-            raise InputError(f"its header is longer than {MAX_HEADER} bytes")
-        yield decoded_text(line).rstrip("\r\n")
+def _lines(header: Header) -> Iterator[str]:
+    """The lines of a header; those that list coordinates may be long."""
+    while line := header.line(MAX_HEADER):
+        text = decoded_text(line).rstrip("\r\n")
+        if len(line) > MAX_LINE and ":=" not in text[:MAX_LINE]:
+            raise InputError(f"its header has a line of more than {MAX_LINE} bytes")
+        yield text
 
 
 def _parted(line: str, separator: str) -> tuple[str, str]:
     """The key and the value of a line."""
     key, found, value = line.partition(separator)
     if not found:
-        raise InputError(f"its header has the line {line[:60]!r}")
+        raise InputError(f"its header has the line {line[:60]!r}, which is cut or no field")
     return key.strip(), value.strip()
 
 
@@ -188,9 +212,11 @@ def dtype_of(fields: Fields) -> np.dtype[Any]:
     kind = TYPES.get(" ".join(fields.get("type", "").lower().split()))
     if kind is None:
         raise InputError(f"its values are of the type {fields.get('type')!r}, which has no numbers")
-    order = fields.get("endian", "little").lower()
+    is_text = ENCODINGS.get(fields.get("encoding", "").lower()) == "text"
+    orderless = is_text or np.dtype(kind).itemsize == 1
+    order = fields.get("endian", "little" if orderless else "").lower()
     if order not in ENDIANS:
-        raise InputError(f"its byte order is {order!r}")
+        raise InputError(f"its byte order is {order!r}; endian: little, or big, is needed")
     return np.dtype(ENDIANS[order] + kind)
 
 
@@ -204,7 +230,8 @@ def whole(fields: Fields, name: str, default: int = 0, least: int = -1) -> int:
 
 NRRD_SUFFIXES = (".nrrd", ".nhdr")
 
-NAMES = "data file|sample units|axis mins|space directions|space origin|line skip|byte skip"
+NAMES = "data file|sample units|axis mins|axis maxs|space directions|space origin|line skip"
+NAMES += "|byte skip"
 ALIASES = {name.replace(" ", ""): name for name in NAMES.split("|")} | {"centers": "centerings"}
 """Names of fields without blanks, and the usual names."""
 
@@ -221,11 +248,11 @@ def read_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     """
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
-    with path.open("rb") as file:
-        first = file.readline(MAX_HEADER)
+    with Header(path) as header:
+        first = header.line()
         if not re.fullmatch(rb"NRRD000[1-5]\r?\n", first):
             raise InputError(f"it begins with {first[:20]!r}; NRRD0001 to NRRD0005 can be read")
-        for line in _lines(file):
+        for line in _lines(header):
             if not line:
                 break
             key, separator, value = line.partition(":=")
@@ -238,12 +265,15 @@ def read_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
             key = re.sub(r"[ _-]", "", key.lower())
             fields[ALIASES.get(key, key)] = value
             if ALIASES.get(key) == "data file" and value.split()[:1] == ["LIST"]:
-                fields["list"] = decoded_text(file.read(MAX_HEADER))
+                fields["list"] = decoded_text(header.file.read(MAX_HEADER))
                 break
+        else:
+            if "data file" not in fields:
+                raise InputError("its header has no empty line at its end; it is cut")
         packed = ENCODINGS.get(fields.get("encoding", "").lower()) in KINDS
         if packed and whole(fields, "byte skip"):
             raise InputError("it skips decompressed bytes, which is not supported")
-        return fields, pairs, file.tell()
+        return fields, pairs, header.file.tell()
 
 
 def words_of(fields: Fields, name: str, count: int, default: str) -> list[str]:
@@ -288,11 +318,12 @@ def open_nrrd(path: Path, request: Request) -> Source:
     return _opened(path, request, read_header)
 
 
-def _axes(fields: Fields, sizes: Sequence[int]) -> list[str]:
+def _axes(fields: Fields, pairs: Fields, sizes: Sequence[int]) -> list[str]:
     """The axis of each dimension (fastest first), "" for that of components.
 
     The file's kinds, labels and space directions say which dimension is time or components; the
-    others are x, y and z in their order.
+    others are x, y and z in their order. A list with the type or the values of an index is a
+    sequence of 3D Slicer, and time.
     """
     directions = directions_of(fields, len(sizes))
     kinds = words_of(fields, "kinds", len(sizes), "domain")
@@ -300,12 +331,18 @@ def _axes(fields: Fields, sizes: Sequence[int]) -> list[str]:
     vector = None
     labels = re.findall(r'"((?:[^"\\]|\\.)*)"', fields.get("labels", ""))
     space = fields.get("space", "")
+    sequences = [
+        place
+        for place in range(len(sizes))
+        if any(f"axis {place} index {key}" in pairs for key in ("type", "values"))
+    ]
     for place, kind in enumerate(kinds):
         label = labels[place] if len(labels) == len(sizes) else ""
         if kind in COLOURS:
             raise InputError(f"its values are colours ({kind}); one number a vertex can be read")
         named = kind in (*SPATIAL, "list") and role_of_name(label) == "t"
-        if kind == "time" or named or (kind == "list" and place == 3 and vector is None):
+        listed = kind == "list" and (place in sequences or (place == 3 and vector is None))
+        if kind == "time" or named or listed:
             axes[place] = "t"
         elif kind not in SPATIAL or (directions is not None and directions[place] is None):
             last_time = place == len(sizes) - 1 and (space.endswith("time") or kind in SPATIAL)
@@ -338,6 +375,8 @@ def _coordinates(
     for axis, unit in zip(axes, units, strict=False):
         if axis in coords and unit:
             coords[axis] = replace(coords[axis], attributes={"units": unit})
+    if "t" in axes:
+        coords |= _sequence(pairs, axes.index("t"), sizes[axes.index("t")])
     for axis in AXES:  # those that a file of this project lists, with their names and units
         if f"coordinates_{axis}" in pairs:
             length = sizes[axes.index(axis)] if axis in axes else 1
@@ -349,16 +388,30 @@ def _coordinates(
     return coords
 
 
+def _sequence(pairs: Fields, place: int, length: int) -> dict[str, Variable]:
+    """The times of a sequence of 3D Slicer along a dimension; none where they are no numbers."""
+    words = unquote(pairs.get(f"axis {place} index values", "")).split()
+    if len(words) != length or not all(map(is_number, words)):
+        return {}
+    unit = pairs.get(f"axis {place} index unit", "").strip('" ')
+    values = [float(word) for word in words]
+    return {"t": positions(AXIS_NAMES["t"], values, {"units": unit} if unit else {})}
+
+
 def _even(fields: Fields, sizes: Sequence[int], axes: Sequence[str]) -> dict[str, Variable]:
     """Coordinates from directions and origin, else from spacings and minima."""
     coords: dict[str, Variable] = {}
     count = len(sizes)
     spacings = numbers_of(fields.get("spacings", "nan " * count), count)
     minima = numbers_of(fields.get("axis mins", "nan " * count), count)
+    maxima = numbers_of(fields.get("axis maxs", "nan " * count), count)
     centres = words_of(fields, "centerings", count, "???")
-    for axis, step, low, length, centre in zip(axes, spacings, minima, sizes, centres, strict=True):
+    lines = zip(axes, spacings, minima, maxima, sizes, centres, strict=True)
+    for axis, step, low, high, length, centre in lines:
         if axis and np.isfinite([step, low]).any():
             first = 0.5 if centre == "cell" and np.isfinite(low) else 0.0
+            if not np.isfinite(step) and np.isfinite(high):
+                step = (high - low) / max(1, length - (centre != "cell"))
             start, by = low if np.isfinite(low) else 0.0, step if np.isfinite(step) else 1.0
             coords[axis] = lattice(axis, start, by, length, first=first)
     directions = directions_of(fields, count)
@@ -397,15 +450,15 @@ def open_metaimage(path: Path, request: Request) -> Source:
 def _metaimage_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     """The header in the fields of NRRD, no pairs, and the first byte behind it."""
     fields: dict[str, str] = {}
-    with path.open("rb") as file:
-        for line in _lines(file):
+    with Header(path) as header:
+        for line in _lines(header):
             key, value = _parted(line, "=") if line.strip() else ("", "")
             fields[key] = value
             if key == "ElementDataFile":
                 if value.split()[:1] == ["LIST"]:
-                    fields["list"] = decoded_text(file.read(MAX_HEADER))
+                    fields["list"] = decoded_text(header.file.read(MAX_HEADER))
                 break
-        end = file.tell()
+        end = header.file.tell()
     if "ElementDataFile" not in fields:
         raise InputError("its header has no ElementDataFile; the file is cut or no MetaImage")
     if fields.get("ObjectType", "Image") != "Image":
@@ -436,6 +489,8 @@ def _metaimage_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
         "endian": "big" if big else "little",
         "encoding": "gzip" if _is_true(fields, "CompressedData") else plain,
         "byte skip": fields.get("HeaderSize", "0"),
+        "slope": fields.get("ElementToIntensityFunctionSlope", "1"),
+        "offset": fields.get("ElementToIntensityFunctionOffset", "0"),
         "space directions": " ".join(["none", *map(_vector, spacing[:, None] * turn)]),
         "space origin": _vector(origin),
         "list": fields.get("list", ""),
@@ -542,7 +597,7 @@ def open_npy(path: Path, request: Request) -> Source:
             f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
             f" numpy.load('{path.name}')[NAME])"
         )
-    with refusing(f"{source} cannot be read as .npy"):
+    with refusing(f"{source} cannot be read as .npy: it is cut, or damaged"):
         # opened as a map for its header only: type, shape, order and the offset of the values;
         # Python objects are refused by it
         header = np.load(path, mmap_mode="r", allow_pickle=False)

@@ -246,6 +246,7 @@ class JoinedSeries(Series):
         self._current: tuple[int, FileSeries] | None = None
         self._parts: list[_Part] = []
         names: list[str] = []
+        limits: list[tuple[Any, Any] | None] = []
         counted = True
         files: list[Path] = []
         shares: dict[Path, npt.NDArray[np.float64]] = {}
@@ -263,6 +264,7 @@ class JoinedSeries(Series):
                 never = never or told
                 shares[path] = np.zeros(part.shape[0]) if told is None else told.shares
                 names.append(part.name)
+                limits.append(part.valid)
                 self.remark = self.remark or part.remark
                 counted = counted and not part.remark.endswith(NUMBERED)
                 files += part.files
@@ -270,6 +272,10 @@ class JoinedSeries(Series):
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
         self.inherit(first)
+        # files packed by scales of their own have the same limit as different values
+        ends = [each for each in limits if each is not None]
+        whole = len(ends) == len(limits)
+        self.valid = (min(e[0] for e in ends), max(e[1] for e in ends)) if whole else None
         if overlap is not None:
             if not counted:
                 raise InputError(f"{pattern}: --overlap is for files with times; some count steps")

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 from fhash_formats.readers.file_series import Request, Stamp, refusing
 from fhash_formats.readers.hdf5 import default_fill
+from fhash_formats.readers.stored_bytes import MAX_HEADER
 from fhash_formats.readers.variables import Source, Variable, file_source
 from fhash_formats.support.values import decoded_text
 
@@ -35,6 +36,10 @@ ATTRIBUTES = 12
 """Tag of a list of attributes."""
 TYPES = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")
 """numpy's names of the types, the first with number 1; those from number 7 on are of CDF-5."""
+MAX_MEMBERS = 1 << 16
+"""Dimensions, variables or attributes of a list; netCDF's own limits are 1024 and 8192."""
+MAX_DIMENSIONS = 64
+"""Dimensions of a variable, as numpy has them."""
 PADDED = 4
 """Bytes to whose multiple names, attributes and arrays are filled up."""
 
@@ -73,7 +78,7 @@ class _Bytes:
         """The next bytes, and their padding passed over."""
         end = self.at + count
         if end > len(self.data):
-            raise ValueError("its header is longer than the file")
+            raise EOFError("its header is longer than the file")
         taken = self.data[self.at : end]
         self.at = end + -end % PADDED
         return taken
@@ -90,6 +95,8 @@ class _Bytes:
         found, count = self.integer(), self.count()
         if found not in (tag, 0) or (not found and count):
             raise ValueError(f"its header has the tag {found} in place of {tag}")
+        if count > MAX_MEMBERS:
+            raise ValueError(f"its header has a list of {count}; {MAX_MEMBERS} are possible")
         for _ in range(count):
             yield decoded_text(self.take(self.count()))
 
@@ -124,10 +131,12 @@ def read_header(path: Path) -> tuple[dict[str, Any], list[Variable]]:
         while True:  # a header is small, and the file may be large
             try:
                 return _parsed(path, data, size)
-            except ValueError:
-                more = file.read(15 * len(data))
+            except EOFError as error:
+                more = file.read(min(15 * len(data), MAX_HEADER - len(data)))
                 if not more:
-                    raise
+                    raise ValueError(
+                        f"its header ends behind its {size} bytes, or {MAX_HEADER}: it is cut"
+                    ) from error
             data += more
 
 
@@ -144,7 +153,10 @@ def _parsed(path: Path, data: bytes, size: int) -> tuple[dict[str, Any], list[Va
     names = list(lengths)
     described = []
     for name in header.members(VARIABLES):
-        numbers = [header.count() for _ in range(header.count())]
+        many = header.count()
+        if many > MAX_DIMENSIONS:
+            raise ValueError(f"{name!r:.40} has {many} dimensions; {MAX_DIMENSIONS} are possible")
+        numbers = [header.count() for _ in range(many)]
         if any(number >= len(names) for number in numbers):
             raise ValueError(f"{name!r:.40} has a dimension that does not exist")
         own, dtype = header.attributes(), header.type()

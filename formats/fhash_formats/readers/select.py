@@ -6,6 +6,7 @@ mean is decided once, by the CF conventions (1.11) where a source follows them.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.cf import (
     SCALING,
     Column,
@@ -24,12 +25,15 @@ from fhash_formats.readers.cf import (
     beside,
     coordinate,
     counts_steps,
+    missing_values,
     only_counts,
     packing,
     real_time,
     role_of_coordinate,
     role_of_name,
+    unapplied,
     usable,
+    valid_limits,
     written_times,
 )
 from fhash_formats.readers.file_series import (
@@ -38,6 +42,7 @@ from fhash_formats.readers.file_series import (
     Request,
     Stored,
     refusing,
+    require_length,
 )
 from fhash_formats.readers.layout import (
     Dimension,
@@ -182,14 +187,21 @@ class Selection:
         if variable.field or variable.dtype.kind not in "iuf":
             return None
         told = variable.attributes if variable.values is None else variable.handle
-        return packing(self.source, variable.dtype, told)
+        return packing(self.source, variable.dtype, told, gaps=variable.hidden is not None)
 
     def _unpacking(self, variable: Variable) -> Read:
-        """The function that reads values in physical units."""
-        packed = self.packing(variable)
+        """The function that reads values in physical units, NaN for hidden ones."""
+        packed, hidden = self.packing(variable), variable.hidden
         if packed is None or variable.values is not None:
             return variable.read
-        return lambda places: packed.unpack(np.asarray(variable.read(places)))
+
+        def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+            values = packed.unpack(np.array(variable.read(places), copy=hidden is not None or None))
+            if hidden is not None:
+                values[np.broadcast_to(hidden(places), values.shape)] = np.nan
+            return values
+
+        return read
 
     def reading(self, variable: Variable) -> Read:
         """The function that reads the values of a variable, of all its steps."""
@@ -347,6 +359,7 @@ class Selection:
     def _made_column(self, variable: Variable) -> Column:
         @cache
         def read() -> npt.NDArray[Any]:
+            require_length(variable.name, max(variable.shape, default=1))
             parts = variable.behind().parts
             if parts is not None and parts.fill == parts.fill:
                 warn_of_column(variable.name, parts)
@@ -540,6 +553,16 @@ class Selection:
         name = plain_name(shown_name(variable.name, names))
         attributes = json_attributes(variable.attributes, without=without) | layout.attributes()
         series = FileSeries(name, stored, coords, attributes)
+        if variable.dtype.kind in "iuf" and not variable.field and not scaled:
+            limits = packed or missing_values(self.source, variable.dtype, ())
+            series.valid = valid_limits(limits, variable.attributes)
+        if (scales := unapplied(variable.attributes)) and not request.raw_values:
+            warnings.warn(
+                f"{self.source}: {name} has {scales}, which no convention known here applies; its"
+                " numbers are read as they are stored",
+                FhashWarning,
+                stacklevel=2,
+            )
         if not variable.members and not variable.field:
             unfit = without if request.raw_values else frozenset[str]()
             series.metadata = partial(

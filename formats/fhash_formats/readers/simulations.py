@@ -20,9 +20,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import Request, Stamp, library, naming
+from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming
 from fhash_formats.readers.layout import Read
-from fhash_formats.readers.stored_bytes import TYPES, FlatArray, lattice, numbers_of
+from fhash_formats.readers.stored_bytes import (
+    MAX_HEADER,
+    TYPES,
+    FlatArray,
+    lattice,
+    numbers_of,
+)
 from fhash_formats.readers.variables import (
     Behind,
     Source,
@@ -37,9 +43,7 @@ from fhash_formats.support.values import decoded_text, text_of
 
 MAX_PLACES = 1 << 22
 """Places between the edges of blocks; those of a level that was cut evenly have one a block."""
-MAX_CELLS = 1 << 24
-"""Cells along an axis."""
-MAX_TABLE = 1 << 26
+MAX_TABLE = 1 << 24
 """Numbers of a table of blocks."""
 
 
@@ -104,8 +108,8 @@ class Blocks:
 
 def _require_small(firsts: npt.NDArray[Any], sizes: npt.NDArray[Any]) -> None:
     """Raise InputError for no blocks, empty ones, and those that are too large or far away."""
-    far = ((firsts <= -MAX_CELLS) | (firsts >= MAX_CELLS)).any()
-    if not len(firsts) or far or (sizes < 1).any() or (sizes >= MAX_CELLS).any():
+    far = ((firsts <= -MAX_AXIS) | (firsts >= MAX_AXIS)).any()
+    if not len(firsts) or far or (sizes < 1).any() or (sizes >= MAX_AXIS).any():
         raise InputError(f"it has {len(firsts)} blocks, or one that is empty or too large")
 
 
@@ -217,7 +221,7 @@ def flash_variables(variables: Sequence[Variable]) -> list[Variable]:
     width = (boxes[..., 1] - boxes[..., 0]).mean(axis=0)
     place = (boxes[..., 0] - low) / np.where(width > 0, width, 1)
     # plot files have positions of 32 bits
-    if not ((abs(place - np.rint(place)) < 0.01) & (place < MAX_CELLS)).all():
+    if not ((abs(place - np.rint(place)) < 0.01) & (place < MAX_AXIS)).all():
         raise InputError("its blocks lie on no grid")
     corners = np.zeros((len(leaves), 3), np.int64)
     corners[:, 3 - place.shape[1] :] = np.rint(place)[:, ::-1]
@@ -242,8 +246,6 @@ def flash_variables(variables: Sequence[Variable]) -> list[Variable]:
 
 PLOTFILES = (b"HyperCLaw", b"NavierStokes")
 """First words of the headers of AMReX and BoxLib."""
-MAX_HEADER = 1 << 27
-"""Bytes of a header that are read."""
 BOX = r"\(\(([-\d,]+)\) \(([-\d,]+)\) \(([-\d,]+)\)\)"
 """A box: its first cell, its last one, and along which axes it is of nodes."""
 FAB = re.compile(rf"FAB \(\(\d+, \([\d ]+\)\),\((\d+), \(([\d ]+)\)\)\){BOX} (\d+)\s*")
@@ -303,12 +305,15 @@ def open_plotfile(path: Path, request: Request) -> Source:
 def _lines(path: Path) -> list[str]:
     """The lines of a header."""
     with path.open("rb") as file:
-        return decoded_text(file.read(MAX_HEADER)).splitlines()
+        data = file.read(MAX_HEADER + 1)
+    if len(data) > MAX_HEADER:
+        raise InputError(f"{path} is longer than {MAX_HEADER} bytes")
+    return decoded_text(data).splitlines()
 
 
 def _within(folder: Path, name: str) -> Path:
     """A file of a folder; raises InputError for one outside of it."""
-    if not re.fullmatch(r"(\w[\w.+-]*/)*\w[\w.+-]*", name):
+    if not all(re.fullmatch(r"\w[\w.+-]*", part) for part in name.split("/")):
         raise InputError(f"its header names the file {name[:80]!r}, which may lie elsewhere")
     return folder / name
 
@@ -320,7 +325,7 @@ def _boxes(text: str) -> list[tuple[npt.NDArray[Any], npt.NDArray[Any]]]:
         first, last, kind = (np.array(each.split(",")[::-1], np.int64) for each in match.groups())
         if kind.any():
             raise InputError("its values are at nodes or faces; those of cells can be read")
-        if (abs(first) >= MAX_CELLS).any() or (abs(last) >= MAX_CELLS).any():
+        if (abs(first) >= MAX_AXIS).any() or (abs(last) >= MAX_AXIS).any():
             raise InputError(f"its box {match[0]} is too large")
         found.append((first, last - first + 1))
     return found

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import bz2
+import re
 import zlib
 from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import replace
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import naming
+from fhash_formats.readers.file_series import naming, require_length
 from fhash_formats.readers.variables import Variable, by_ranges, positions
 from fhash_formats.series import AXIS_NAMES
-from fhash_formats.support.values import is_number
+from fhash_formats.support.values import decoded_text, is_number
 
 TYPE_NAMES = {
     "i1": "signed char|int8|int8_t|met_char",
@@ -33,6 +35,54 @@ TYPE_NAMES = {
 }
 TYPES = {name: short for short, names in TYPE_NAMES.items() for name in names.split("|")}
 """Number types by their names in headers; MetaIO's long has four bytes on every machine."""
+
+MAX_HEADER = 64 * 2**20
+"""Bytes of the longest header; own ones list every coordinate."""
+
+MAX_LINE = 1 << 16
+"""Bytes of the longest line of a header but for those that list coordinates."""
+
+
+class Header:
+    """The header of a file, through which readers of this project take it.
+
+    It has MAX_HEADER bytes at most, and its lines MAX_LINE, so that no header fills the memory.
+    Raises InputError for a longer one. It is a context that closes the file.
+    """
+
+    def __init__(self, path: Path, start: int = 0) -> None:
+        self.file: BinaryIO = path.open("rb")
+        self.file.seek(start)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.file.close()
+
+    def line(self, most: int = MAX_LINE) -> bytes:
+        """The next line with its end; b"" behind the last."""
+        line = self.file.readline(most + 1)
+        if len(line) > most or self.file.tell() > MAX_HEADER + most:
+            raise InputError(
+                f"its header is longer than {MAX_HEADER} bytes, or has a line of more than {most}"
+            )
+        return line
+
+    def words(self) -> list[str]:
+        """The words of the next line that has any; none at the end."""
+        while line := self.line():
+            if words := decoded_text(line).split():
+                return words
+        return []
+
+
+def count_of(text: str, what: str, most: int, least: int = 0) -> int:
+    """A whole number of a header, which counts something; InputError for others and larger ones."""
+    if not re.fullmatch(r"[-+]?[0-9]{1,18}", text) or not least <= int(text) <= most:
+        raise InputError(f"it has {text[:40]!r} {what}; {least} to {most} are possible here")
+    return int(text)
+
 
 BLOCK_BYTES = 8 * 2**20
 """Bytes read at once where the requested values are scattered, as with time fastest."""
@@ -196,23 +246,20 @@ class NumbersInText:
         self, path: Path, dtype: np.dtype[Any], *, start: int, size: int, stop: int | None = None
     ) -> None:
         self.path, self.dtype, self.start, self.size = path, dtype, start, size
-        self._count = -1 if stop is None else stop - start
+        self._stop = path.stat().st_size if stop is None else stop
         count = size // dtype.itemsize
-        if path.stat().st_size - start < 2 * count - 1:
+        if self._stop - start < 2 * count - 1:
             raise InputError(f"{path} is too short for {count} numbers; it is cut")
         self._values: npt.NDArray[np.uint8] | None = None
 
     def readinto(self, place: int, view: memoryview) -> None:
         """Fill a view with the bytes from `place` on."""
         if self._values is None:
-            with self.path.open("rb") as file:
-                file.seek(self.start)
-                words = file.read(self._count).replace(b",", b" ").split()
             count = self.size // self.dtype.itemsize
-            if len(words) != count:
-                raise InputError(f"{self.path} holds {len(words)} numbers, {count} are needed")
-            with naming(str(self.path)):
-                self._values = numbers_of_words(words, self.dtype).view(np.uint8)
+            with self.path.open("rb") as file, naming(str(self.path)):
+                file.seek(self.start)
+                found = numbers_in_text(file, self._stop - self.start, self.dtype, count)
+            self._values = found.view(np.uint8)
         view[:] = self._values[place : place + len(view)].data
 
     def close(self) -> None:
@@ -253,12 +300,39 @@ def numbers_of(text: str, count: int) -> npt.NDArray[np.float64]:
     return np.array([float(word) for word in words])
 
 
+def numbers_in_text(
+    file: BinaryIO, length: int, dtype: np.dtype[Any], count: int
+) -> npt.NDArray[Any]:
+    """The `count` numbers in the next bytes of a file, between blanks or commas.
+
+    Raises InputError for another count, and ValueError for other text. The words of a part are held
+    at once, which take far more bytes than their numbers.
+    """
+    values, found, rest = np.empty(count, dtype), 0, b""
+    while block := file.read(min(length, INFLATED_BYTES)):
+        length -= len(block)
+        words = (rest + block).replace(b",", b" ").split()
+        open_end = length > 0 and block[-1:] not in b", \t\r\n\v\f"
+        rest = words.pop() if open_end and words else b""
+        if len(rest) > LONGEST_NUMBER:
+            raise ValueError("text stands where numbers are needed")
+        if found + len(words) <= count:
+            values[found : found + len(words)] = numbers_of_words(words, dtype)
+        found += len(words)
+    if found != count or rest:  # a rest is that of a file which was cut meanwhile
+        raise InputError(f"it holds {found} numbers, {count} are needed; it is cut or no such grid")
+    return values
+
+
 def numbers_of_words(words: Sequence[bytes], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     """Numbers of a type from their texts; raises ValueError for other text and for larger ones."""
     if max(map(len, words), default=0) > LONGEST_NUMBER:
         raise ValueError("text stands where numbers are needed")
     if dtype.kind == "f":
-        return np.array(words, dtype=f"S{LONGEST_NUMBER}").astype(dtype)
+        try:
+            return np.array(words, dtype=f"S{LONGEST_NUMBER}").astype(dtype)
+        except ValueError as error:
+            raise ValueError(f"{error}; it is cut, or has text in place of numbers") from error
     limits, numbers = np.iinfo(dtype), [int(word) for word in words]
     if numbers and not limits.min <= min(numbers) <= max(numbers) <= limits.max:
         raise ValueError(f"a number is beyond the type {dtype.name}")
@@ -383,16 +457,23 @@ def lattice(
 ) -> Variable:
     """The positions of an even axis: origin + (first + i) * spacing for i below `count`.
 
-    `first` is the index of the first position; a half stands for the centre of a cell. Raises
-    InputError for an origin or a spacing that is not finite, and for a spacing of 0.
+    `first` is the index of the first position; a half stands for the centre of a cell. They are
+    computed when they are read. Raises InputError for an origin or a spacing that is not finite,
+    for a spacing of 0, and for more than MAX_AXIS positions.
     """
+    require_length(axis, count)
     if not np.isfinite([origin, spacing]).all() or (spacing == 0 and count > 1):
         raise InputError(
             f"the grid has the origin {origin} and the spacing {spacing} along {axis}; both must be"
             " finite, and the spacing not 0"
         )
-    values = origin + (first + np.arange(count, dtype=np.float64)) * spacing
-    return positions(AXIS_NAMES[axis], values, {"units": units} if units else {})
+
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        values: npt.NDArray[Any] = origin + (first + np.arange(count, dtype=np.float64)) * spacing
+        return values[places]
+
+    made = positions(AXIS_NAMES[axis], np.empty(0), {"units": units} if units else {})
+    return replace(made, shape=(count,), read=read)
 
 
 def axis_steps(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

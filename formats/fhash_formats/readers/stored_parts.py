@@ -53,6 +53,35 @@ Box = tuple[tuple[int, int], ...]
 """First and last + 1 along each dimension."""
 
 
+def hdf5_file(path: Path) -> Any:
+    """An HDF5 file open for reading, also one that a writer holds open in SWMR mode.
+
+    Raises InputError for one that another program is writing in another way, or that is cut.
+    """
+    import h5py
+
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        text = str(error)
+        if "already open for write" in text:  # or its writer ended without closing it
+            with contextlib.suppress(OSError):
+                return h5py.File(path, "r", swmr=True)
+        if "already open for" in text or "unable to lock file" in text:
+            raise InputError(
+                f"{path}: another program is writing it, or ended without closing it; wait until it"
+                " has closed the file, or let it write in SWMR mode, which can be read meanwhile"
+                " (where the file system has no locks: HDF5_USE_FILE_LOCKING=FALSE)"
+            ) from error
+        if "truncated file" in text:
+            size, promised = path.stat().st_size, text.rpartition("=")[2].strip(" )")
+            raise InputError(
+                f"{path} cannot be read as HDF5: it is cut: it has {size} bytes, {promised} are"
+                " promised"
+            ) from error
+        raise
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredParts:
     """A grid of boxes over an array, not all of which are stored.
@@ -335,8 +364,6 @@ class Hdf5Sources:
                 )
 
     def _file(self, dataset: Any, name: str, draws: str) -> Any:
-        import h5py
-
         problem = "which is not there"
         for path in candidates(dataset, name):
             if path in self._open:
@@ -344,8 +371,8 @@ class Hdf5Sources:
             if not path.is_file():
                 continue
             try:
-                file = h5py.File(path, "r")
-            except (OSError, RuntimeError) as error:
+                file = hdf5_file(path)
+            except (InputError, OSError, RuntimeError) as error:
                 problem = f"which cannot be read: {condense(error)}"
                 continue
             if len(self._open) >= MAX_OPEN:
@@ -417,7 +444,7 @@ def require_inside(path: Path, seen: set[Path] | None = None) -> None:
 
     seen = {path.resolve()} if seen is None else seen
     named: dict[str, None] = {}
-    with h5py.File(path, "r") as file:
+    with hdf5_file(path) as file:
         groups, known = [file["/"].id], set()
         while groups:
             group = groups.pop()

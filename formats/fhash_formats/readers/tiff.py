@@ -9,20 +9,24 @@ from __future__ import annotations
 
 import importlib
 import logging
+import re
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 from logging.handlers import BufferingHandler
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
-from fhash_formats.readers.file_series import Request, Stamp, condense, library, naming
-from fhash_formats.readers.stored_bytes import FlatArray, lattice
+from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.file_series import Request, Stamp, condense, library, naming, refusing
+from fhash_formats.readers.stored_bytes import MAX_LINE, FlatArray, lattice
 from fhash_formats.readers.stored_parts import StoredParts
 from fhash_formats.readers.variables import (
     Behind,
@@ -82,13 +86,25 @@ def open_tiff(path: Path, request: Request) -> Source:
     """
     source, stamp = str(path), Stamp.of(path)
     tifffile = library(source, "TIFF", "tifffile", "fhash[formats]")
-    with naming(source), ExitStack() as opened:
+    with naming(source), refusing("it is cut or damaged"), ExitStack() as opened:
         with _strictly():
+            _require_pages(path)
             # the metadata of OME name further files
             file = tifffile.TiffFile(path, _multifile=False if request.no_external else None)
             found = _variables(path, opened.enter_context(file))
         close = opened.pop_all().close
     return file_source(path, found, stamp=stamp, close=close)
+
+
+def _require_pages(path: Path) -> None:
+    """Raise InputError where the first page is described behind the end of the file."""
+    with path.open("rb") as file:
+        head = file.read(16)
+    order: Literal["little", "big"] = "little" if head[:2] == b"II" else "big"
+    place = head[8:16] if head[:4] in MAGIC[2:] else head[4:8]
+    first, size = int.from_bytes(place, order), path.stat().st_size
+    if head[:4] in MAGIC and not 8 <= first < size:
+        raise InputError(f"it is cut: its pages are listed at byte {first}, it has {size}")
 
 
 def _variables(path: Path, file: Any) -> list[Variable]:
@@ -118,11 +134,71 @@ def _variables(path: Path, file: Any) -> list[Variable]:
         behind=lambda: Behind(parts=_stored_parts(series, kept)),
     )
     lengths = {axis: shape[n] for n, axis in enumerate(axes) if axis}
+    whole = _meant(str(path), file, whole)
     arrays = [whole]
     if CHANNEL in axes:
         place = kept.index(axes.index(CHANNEL))
         arrays = components(whole, place, _channel_names(file), interleaved=False)
     return placed(arrays, _coordinates(file, lengths))
+
+
+NO_DATA = 42113
+"""Tag in which GDAL keeps the number that stands for missing values."""
+ROLES = {"scale": "scale_factor", "offset": "add_offset", "unittype": "units"}
+"""Attributes for the roles of items in GDAL's metadata."""
+ITEM = re.compile(r'<Item name="[^"<>]*" sample="0" role="(\w{1,20})">([^<>]{1,80})</Item>')
+LINE = 0
+"""Function of ImageJ's calibration that is a line c0 + c1 * count."""
+NO_FUNCTION = 20
+"""Code of ImageJ's calibration for none; those between are curves."""
+SHOWN = {0: "0 is white in its pictures", 3: "its pictures have a palette of colours"}
+"""Remarks by the code of PhotometricInterpretation, of what numbers alone do not tell."""
+
+
+def _meant(source: str, file: Any, whole: Variable) -> Variable:
+    """The array with what its metadata say of its numbers: missing ones, scale, units, sign.
+
+    ImageJ keeps signed numbers of 16 bits as unsigned ones with a calibration. Warns (FhashWarning)
+    of what the numbers alone do not tell.
+    """
+    page = file.series[0].keyframe
+    found: dict[str, Any] = {}
+    tag = page.tags.get(NO_DATA)
+    if tag is not None and is_number(str(tag.value)):
+        found["_FillValue"] = float(str(tag.value))
+    for role, text in ITEM.findall(str(file.gdal_metadata or "")[:MAX_LINE]):
+        if role == "unittype" or (role in ROLES and is_number(text)):
+            found[ROLES[role]] = text if role == "unittype" else np.float64(text)
+    told: Mapping[str, Any] = (file.imagej_metadata or {}) if file.is_imagej else {}
+    shown = page.tags.get("PhotometricInterpretation")
+    remarks = [] if shown is None or int(shown.value) not in SHOWN else [SHOWN[int(shown.value)]]
+    orientation = page.tags.get("Orientation")
+    if orientation is not None and int(orientation.value) != 1:
+        remarks.append(f"its pictures are turned or mirrored (Orientation {orientation.value})")
+    if told.get("cf", NO_FUNCTION) == LINE:
+        offset, scale = (_number(told.get(name)) for name in ("c0", "c1"))
+        if whole.dtype.kind == "u" and whole.dtype.itemsize == 2 and (scale, offset) == (1, -32768):
+            return replace(whole, dtype=np.dtype("i2"), read=partial(_signed, whole))
+        if np.isfinite([scale, offset]).all() and scale:
+            found |= {"scale_factor": np.float32(scale), "add_offset": np.float32(offset)}
+            found["units"] = str(told.get("vunit", ""))
+    elif told.get("cf", NO_FUNCTION) < NO_FUNCTION:
+        remarks.append("ImageJ's calibration by a curve is not applied")
+    if remarks:
+        warnings.warn(
+            f"{source}: {'; '.join(remarks)}; the numbers are read as they are stored",
+            FhashWarning,
+            stacklevel=2,
+        )
+    return replace(whole, attributes=found)
+
+
+def _signed(whole: Variable, places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+    """Numbers of 16 bits that are stored 32768 larger than they are."""
+    values: npt.NDArray[Any] = (np.asarray(whole.read(places)).astype(np.int32) - 32768).astype(
+        "i2"
+    )
+    return values
 
 
 def _stored_parts(series: Any, kept: Sequence[int]) -> StoredParts | None:
@@ -265,6 +341,8 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source 
     differ from the first.
     """
     tifffile = library(pattern, "TIFF", "tifffile", "fhash[formats]")
+    for path in paths:
+        request.beside(path, path)
     with naming(str(paths[0])), _strictly(), tifffile.TiffFile(paths[0]) as file:
         if len(file.series) != 1 or len(paths) == 1:
             return None
@@ -287,13 +365,15 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source 
         planes = [_plane(tifffile, paths[n], shape, dtype)[rows, columns] for n in ranges[0]]
         return np.stack(planes)
 
-    whole = Variable(
+    described = Variable(
         name=paths[0].stem.rstrip("0123456789_-. ") or paths[0].stem,
         shape=(len(paths), *shape),
         dtype=dtype,
         dimensions=tuple(AXIS_NAMES[axis] for axis in request.axes),
         read=by_ranges((len(paths), *shape), get),
     )
+    with naming(str(paths[0])), tifffile.TiffFile(paths[0]) as file:
+        whole = _meant(str(paths[0]), file, described)
     found, stamp = placed([whole], coords), Stamp.of(paths[0])
     return Source(name=pattern, variables=found, stamp=stamp, files=paths)
 

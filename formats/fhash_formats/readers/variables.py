@@ -109,6 +109,8 @@ class Variable:
         field: path of names in a compound type, () where the array is no such.
         members: arrays of the same kind, one a step; () for an array that the file holds as one
             (`join`).
+        hidden: gives, for places along each dimension, True where the format says that the value is
+            to be ignored; None where all count. Such values are missing.
     """
 
     name: str
@@ -130,6 +132,7 @@ class Variable:
     handle: Any = None
     field: tuple[str, ...] = ()
     members: tuple[Variable, ...] = ()
+    hidden: Read | None = None
 
     def __post_init__(self) -> None:
         given = [None if each and each.startswith(MADE_UP) else each for each in self.dimensions]
@@ -626,6 +629,11 @@ def components(
         all are read for one.
     """
     count = whole.shape[place]
+    if count > MAX_COMPONENTS:
+        raise InputError(
+            f"{whole.name} has {count} components; {MAX_COMPONENTS} can be told apart, --axes says"
+            " what the dimension is"
+        )
 
     def one(number: int, name: str) -> Variable:
         def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
@@ -657,6 +665,9 @@ def _component_names(count: int, given: Sequence[str | None]) -> list[str]:
         return names
     return list(LETTERS) if count == len(LETTERS) else [str(number) for number in range(count)]
 
+
+MAX_COMPONENTS = 1 << 12
+"""Components of an array, each of which is a variable."""
 
 LETTERS = ("x", "y", "z")
 """Names of the components of a vector with three of them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -15,12 +16,25 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming
+from fhash_formats.errors import InputError
+from fhash_formats.readers.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    naming,
+    refusing,
+    require_length,
+)
 from fhash_formats.readers.hdf5 import is_hdf5, open_hdf5
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.select import open_selected
-from fhash_formats.readers.stored_bytes import axis_steps, lattice, numbers_of
+from fhash_formats.readers.stored_bytes import (
+    MAX_LINE,
+    axis_steps,
+    lattice,
+    numbers_of,
+)
+from fhash_formats.readers.stored_parts import hdf5_file
 from fhash_formats.readers.variables import (
     HEADER,
     Behind,
@@ -29,6 +43,7 @@ from fhash_formats.readers.variables import (
     components,
     file_source,
     placed,
+    plain_name,
     positions,
 )
 from fhash_formats.readers.vtk_document import Document, Element, VtkArrays
@@ -41,11 +56,25 @@ KINDS = ("ImageData", "RectilinearGrid")
 PARALLEL_KINDS = ("PImageData", "PRectilinearGrid")
 """Kinds of files that list the files of their pieces."""
 PLACES = ("PointData", "CellData")
-GHOSTS = ("vtkGhostType", "vtkValidPointMask")
-"""Arrays that say which values count, and are none themselves."""
+GHOSTS = {
+    "vtkGhostType": {"PointData": 2, "CellData": 32},
+    "avtGhostNodes": {"PointData": 2},
+    "avtGhostZones": {"CellData": 16 | 32},
+    "vtkGhostLevels": {},
+    "vtkValidPointMask": {"PointData": 0},
+}
+"""Arrays that say which values count, and are none themselves, with the bits of values to ignore.
+
+Sources: HIDDENPOINT and HIDDENCELL (vtkDataSetAttributes.h); NODE_NOT_APPLICABLE_TO_PROBLEM, and
+ZONE_EXTERIOR_TO_PROBLEM and ZONE_NOT_APPLICABLE_TO_PROBLEM (VisIt's avtGhostData.h). Other bits and
+levels are those of duplicates, which are sound. 0: the number 0 hides a value.
+"""
 
 EVEN = ("0 0 0", "1 1 1", "1 0 0 0 1 0 0 0 1")
 """Origin, spacing and direction where a file does not say them."""
+
+MAX_PIECES = 1 << 12
+"""Files of the pieces of a grid."""
 
 Extent = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
 """First and last point (z, y, x)."""
@@ -117,7 +146,8 @@ def _grid(
         )
     extent = _extent(element.attributes.get("WholeExtent", ""))
     arrays = VtkArrays(path, document)
-    holders, files, pieces = [(element, arrays), (root, arrays)], [], []
+    files: list[Path] = []
+    holders, pieces = [(element, arrays), (root, arrays)], []
     for piece in element.all("Piece"):
         own = _extent(piece.attributes.get("Extent", element.attributes["WholeExtent"]))
         if any(last < first for first, last in own):
@@ -127,12 +157,11 @@ def _grid(
             continue
         if not piece.attributes.get("Source"):
             raise InputError("a piece names no file")
-        files.append(path.parent / piece.attributes["Source"])
-        if not files[-1].is_file():
-            raise MissingInputError(f"{path} lists {files[-1]}, which is not there")
-        if files[-1] in files[:-1]:
+        if len(files) == MAX_PIECES:
+            raise InputError(f"it lists more than {MAX_PIECES} pieces")
+        files.append(request.beside(path, path.parent / piece.attributes["Source"]))
+        if len({*files}) < len(files):
             raise InputError(f"it lists {files[-1].name} twice")
-        request.require_inside(path, files[-1])
         with naming(str(files[-1])):
             listed = _grid(files[-1], request, (kind[1:],))
         pieces += listed.pieces
@@ -150,9 +179,9 @@ def _grid(
 def _extent(text: str) -> Extent:
     """The extent of VTK's text x0 x1 y0 y1 z0 z1."""
     try:
-        x0, x1, y0, y1, z0, z1 = map(int, text.split())
+        x0, x1, y0, y1, z0, z1 = map(int, text[:MAX_LINE].split())
     except ValueError as error:
-        raise InputError(f"the extent is {text!r}, not six whole numbers") from error
+        raise InputError(f"the extent is {text[:80]!r}, not six whole numbers") from error
     return (z0, z1), (y0, y1), (x0, x1)
 
 
@@ -167,25 +196,52 @@ def _shape(extent: Extent, place: str) -> tuple[int, int, int]:
 def _arrays(source: str, grid: _Grid, place: str) -> list[Variable]:
     """The arrays of points or of cells; their place precedes a name that both have."""
     first = grid.pieces[0]
-    names = [_named(each) for where in PLACES for each in first.element.arrays(where)]
+    names = Counter(_named(each) for where in PLACES for each in first.element.arrays(where))
     found: list[Variable] = []
     for number, element in enumerate(first.element.arrays(place)):
         name, text = _named(element), element.attributes.get("NumberOfComponents", "1")
         if not re.fullmatch("0*[1-9][0-9]{0,2}", text):
             raise InputError(f"the array {name} has {text!r} components")
         whole = Variable(
-            name=name if names.count(name) == 1 else f"{place}/{name}",
+            name=name if names[name] == 1 else f"{place}/{name}",
             shape=(*_shape(grid.extent, place), int(text)),
             dtype=first.arrays.dtype(element),
             dimensions=SPACE,
             attributes=_units(element),
-            auxiliary=name in GHOSTS,
             read=partial(_read, source, grid, place, number),
             require=partial(_check, source, grid, place, number),
         )
         parts = [element.attributes.get(f"ComponentName{i}") for i in range(int(text))]
         found += components(whole, len(SPACE), parts)
-    return found
+    return without_hidden(found, place)
+
+
+def without_hidden(arrays: Sequence[Variable], place: str) -> list[Variable]:
+    """The arrays of points or of cells, those of GHOSTS auxiliary, and what these hide hidden.
+
+    place: "PointData" or "CellData".
+    """
+    ghosts = [each for each in arrays if plain_name(each.name) in GHOSTS]
+    marks = [
+        (each, GHOSTS[plain_name(each.name)][place])
+        for each in ghosts
+        if place in GHOSTS[plain_name(each.name)]
+    ]
+
+    def hidden(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        found = []
+        for each, bits in marks:
+            marked = np.asarray(each.read(places)).astype(np.int64)
+            found.append((marked & bits) != 0 if bits else marked == 0)
+        values: npt.NDArray[np.bool_] = np.any(found, axis=0)
+        return values
+
+    return [
+        replace(each, auxiliary=True)
+        if each in ghosts
+        else replace(each, hidden=hidden if marks else None)
+        for each in arrays
+    ]
 
 
 def _named(element: Element) -> str:
@@ -295,6 +351,7 @@ def _listed(grid: _Grid, *, cells: bool) -> dict[str, Variable]:
     """Coordinates of a rectilinear grid, put together from its pieces."""
     coords = {}
     for axis, (low, high) in zip(SPACE, grid.extent, strict=True):
+        require_length(axis, high - low + 1)
         values = np.full(high - low + 1, np.nan)
         for piece in grid.pieces:
             first, last = piece.extent[SPACE.index(axis)]
@@ -329,11 +386,9 @@ def is_vtkhdf(head: bytes, path: Path) -> bool:
     if path.suffix.lower() in VTKHDF_SUFFIXES:
         return True
     try:
-        import h5py
-
-        with h5py.File(path, "r") as file:
+        with hdf5_file(path) as file:
             return "VTKHDF" in file
-    except (ImportError, OSError, RuntimeError, KeyError):
+    except (ImportError, InputError, OSError, RuntimeError, KeyError):
         return False  # the reader of HDF5 says what is wrong
 
 
@@ -389,20 +444,20 @@ def _hdf_arrays(
     known: Mapping[str, Variable], place: str, space: tuple[int, ...], times: Variable | None
 ) -> list[Variable]:
     """Arrays of points or of cells; the place precedes a name that both have."""
-    names = [each.rpartition("/")[2] for each in known if each.rpartition("/")[0] in PLACES]
+    names = Counter(plain_name(each) for each in known if each.rpartition("/")[0] in PLACES)
     found: list[Variable] = []
     for path, stored in known.items():
         where, _, name = path.rpartition("/")
         if where != place:
             continue
-        shape, full = stored.shape, path if names.count(name) > 1 else name
+        shape, full = stored.shape, path if names[name] > 1 else name
         inner = shape if times is None else shape[1:]
         if inner[:3] != space or len(inner) not in (3, 4):
             error = f"a shape {shape} that does not fit the grid (z, y, x) = {space}"
             found.append(Variable(name=full, shape=shape, dtype=stored.dtype, error=error))
             continue
         dims = SPACE if times is None else (AXIS_NAMES["t"], *SPACE)
-        whole = replace(stored, name=full, dimensions=dims, auxiliary=name in GHOSTS, scales={})
+        whole = replace(stored, name=full, dimensions=dims, scales={})
         if times is not None:
             offsets = known.get(f"Steps/{place}Offsets/{name}")
             entries = np.arange(times.shape[0]) if offsets is None else offsets.whole()
@@ -416,7 +471,7 @@ def _hdf_arrays(
             )
         vector = len(inner) > len(space)
         found += components(whole, len(dims), interleaved=False) if vector else [whole]
-    return found
+    return without_hidden(found, place)
 
 
 def _hdf_read(
@@ -496,7 +551,6 @@ def open_pvd(path: Path, request: Request) -> CollectionSeries:
         entries = _entries(path)
         if not entries:
             raise InputError("it lists no file")
-        request.require_inside(path, *(file for _, file in entries))
         times = np.array([time for time, _ in entries])
         if not np.isfinite(times).all():
             raise InputError("it lists a time that is no finite number")
@@ -508,9 +562,7 @@ def open_pvd(path: Path, request: Request) -> CollectionSeries:
                 " part a step can be read (in ParaView, merge the parts first)"
             )
         for _, file in entries:
-            if not file.is_file():
-                raise MissingInputError(f"{path} lists {file}, which is not there")
-            with file.open("rb") as opened:
+            with request.beside(path, file).open("rb") as opened:
                 if not is_vtk_xml(opened.read(4096), file):
                     told = ".vti, .vtr, .pvti and .pvtr can be read"
                     raise InputError(f"it lists {file.name}; {told}")
@@ -525,7 +577,8 @@ def _entries(path: Path) -> list[Entry]:
     if path.suffix.lower() == ".series":
         if path.stat().st_size > MAX_LIST:
             raise InputError(f"it is larger than {MAX_LIST} bytes")
-        told = json.loads(path.read_text(encoding="utf-8"))
+        with refusing("it is cut, or no JSON"):
+            told = json.loads(path.read_text(encoding="utf-8"))
         rows = told.get("files") if isinstance(told, dict) else None
         if not isinstance(rows, list) or not all(
             isinstance(row, dict) and isinstance(row.get("name"), str) for row in rows

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.readers.file_series import naming, refusing
-from fhash_formats.readers.stored_bytes import DEFLATE_RATIO, numbers_of_words
+from fhash_formats.readers.stored_bytes import DEFLATE_RATIO, numbers_in_text
 from fhash_formats.support.values import DTYPES
 
 CHUNK_BYTES = 2**18
@@ -217,10 +217,8 @@ class VtkArrays:
         with self._naming(array), self.path.open("rb") as file:
             if self._is_ascii(array):
                 file.seek(array.start)
-                words = file.read(array.stop - array.start).split()
-                if len(words) != count:
-                    raise InputError(f"it has {len(words)} values, not {count}")
-                return numbers_of_words(words, dtype)
+                self.check(array, count)
+                return numbers_in_text(file, array.stop - array.start, dtype, count)
             stream = self._stream(file, array)
             blocks = self._begin(stream, count * dtype.itemsize)
             if not self.compressor:
@@ -276,7 +274,7 @@ class VtkArrays:
         blocks = [(size, block) for size in stored]
         if last:
             blocks[-1] = (stored[-1], last)
-        if self.compressor == ZLIB and any(w > DEFLATE_RATIO * n for n, w in blocks):
+        if any(true > RATIOS[self.compressor] * size for size, true in blocks):
             raise InputError(f"it has blocks that hold fewer bytes, not {expected} for the grid")
         return blocks
 
@@ -361,9 +359,14 @@ def _inflated(inflating: Any, stored: bytes, size: int) -> bytes:
 
 ZLIB = "vtkZLibDataCompressor"
 LZ4 = "vtkLZ4DataCompressor"
+LZMA = "vtkLZMADataCompressor"
+LZMA_MEMORY = 1 << 28
+"""Bytes that LZMA may take for its dictionary: 64 MiB at its highest level, and some more."""
+RATIOS = {ZLIB: DEFLATE_RATIO, LZ4: 255, LZMA: 1 << 16}
+"""Factors that no block of a compressor shrinks beyond; that of LZMA is far above its 7,000."""
 COMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
     ZLIB: lambda stored, size: _inflated(zlib.decompressobj(), stored, size),
-    "vtkLZMADataCompressor": lambda stored, size: _inflated(lzma.LZMADecompressor(), stored, size),
+    LZMA: lambda stored, size: _inflated(lzma.LZMADecompressor(memlimit=LZMA_MEMORY), stored, size),
     LZ4: lambda stored, size: importlib.import_module("lz4.block").decompress(stored, size),
 }
 """Functions that give the true bytes of a stored block, at most one more than it should have."""

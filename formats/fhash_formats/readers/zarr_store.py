@@ -22,7 +22,7 @@ from fhash_formats.readers.file_series import (
     naming,
     refusing,
 )
-from fhash_formats.readers.stored_bytes import lattice
+from fhash_formats.readers.stored_bytes import MAX_HEADER, lattice
 from fhash_formats.readers.stored_parts import zarr_parts
 from fhash_formats.readers.variables import (
     HEADER,
@@ -47,16 +47,27 @@ def metadata_file(path: Path) -> Path | None:
     return next((path / name for name in METADATA if (path / name).is_file()), None)
 
 
-def nodes_in_folder(folder: Path, place: str = "") -> Iterator[str]:
-    """Paths of all groups and arrays below a group.
+def nodes_in_folder(folder: Path) -> Iterator[str]:
+    """Paths of all groups and arrays below a group, each once, whatever links lead to it.
 
     Folders of chunks have no metadata and are not entered.
     """
-    for child in sorted(folder.iterdir()):
-        if child.is_dir() and metadata_file(child) is not None:
-            yield f"{place}{child.name}"
-            if not (child / ".zarray").is_file():
-                yield from nodes_in_folder(child, f"{place}{child.name}/")
+    waiting, seen = [(folder, "")], set()
+    while waiting:
+        here, place = waiting.pop()
+        state = here.stat()
+        if (state.st_dev, state.st_ino) in seen:
+            continue
+        seen.add((state.st_dev, state.st_ino))
+        if place:
+            yield place
+        if not place or not (here / ".zarray").is_file():
+            children = [each for each in sorted(here.iterdir(), reverse=True) if each.is_dir()]
+            waiting += [
+                (child, f"{place}/{child.name}".lstrip("/"))
+                for child in children
+                if metadata_file(child) is not None
+            ]
 
 
 def nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
@@ -64,8 +75,14 @@ def nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
 
     The place is the top, or the one folder that was zipped.
     """
-    with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
+    with (
+        refusing(f"{source} cannot be read as a ZIP, it is cut or damaged"),
+        zipfile.ZipFile(path) as file,
+    ):
         names = file.namelist()
+        for each in file.infolist():
+            if each.filename.endswith(METADATA) and each.file_size > MAX_HEADER:
+                raise InputError(f"{source}: {each.filename[:80]} has {each.file_size} bytes")
     nodes = sorted(
         {name.rpartition("/")[0] for name in names if name.rpartition("/")[2] in METADATA}
     )
@@ -180,6 +197,8 @@ def open_zarr(path: Path, request: Request) -> Source:
         if alone and metadata_file(place.parent) is not None:
             # an array of a group, named by its folder: its coordinates are beside it
             store.close()
+            if request.no_external:
+                request.require_inside(path, place.parent, *place.parent.rglob("*"))
             return replace(
                 open_zarr(place.parent, replace(request, var=place.name)), only=place.name
             )

@@ -25,6 +25,7 @@ DAY = 86_400 * SECOND
 """Nanoseconds of a day."""
 
 UNIT_NAMES = {
+    365 * DAY: "common_year common_years",
     7 * DAY: "week weeks",
     DAY: "day days d",
     3600 * SECOND: "hour hours hr hrs h",
@@ -35,7 +36,7 @@ UNIT_NAMES = {
     1: "nanosecond nanoseconds nsec ns",
 }
 UNITS = {name: length for length, names in UNIT_NAMES.items() for name in names.split()}
-"""Nanoseconds of each unit of time."""
+"""Nanoseconds of each unit of time; common years, as cftime has them, are of noleap alone."""
 
 MONTH_UNITS = {"month": 1, "months": 1, "year": 12, "years": 12, "yr": 12, "yrs": 12}
 """Months of each unit of changing length."""
@@ -71,6 +72,15 @@ LARGEST_YEAR = 10**6
 
 SINCE = re.compile(r"\s*(\S+)\s+since\s+(\S.*?)\s*", re.IGNORECASE)
 """Units of a time that is counted since something."""
+
+NUMERIC = re.compile(
+    r"\s*(?:\w+\s+as\s+)?(?:%Y(?P<month>%m(?P<day>%d)?)?|(?i:YYYY(?P<mm>MM(?P<dd>DD)?)?))"
+    r"(?:\.%?[fF]*)?\s*"
+)
+"""Units of a time whose digits are those of a date, as GrADS, CDO and ECHAM write them.
+
+Behind the point is a share of the day, the month or the year.
+"""
 
 WRITTEN = re.compile(
     r"(\d{4})[-/.]?(\d\d)[-/.]?(\d\d)(?:[-_T ]*(\d\d):?(\d\d)?:?(\d\d(?:\.\d+)?)?)?Z?"
@@ -140,13 +150,13 @@ def clock(attributes: Mapping[str, Any]) -> Clock | None:
     None where they name no date, as "s", "months since ..." or a calendar that is not known.
     """
     match = re.fullmatch(
-        r"\s*([A-Za-zµ]+)\s+(?:since|after|from|ref)\s+(.+?)\s*", str(attributes.get("units", ""))
+        r"\s*([A-Za-zµ_]+)\s+(?:since|after|from|ref)\s+(.+?)\s*", str(attributes.get("units", ""))
     )
     calendar = CALENDARS.get(str(attributes.get("calendar") or "standard").strip().lower())
     if match is None or calendar is None:
         return None
     unit = UNITS.get(match[1], UNITS.get(match[1].lower()))
-    if unit is None:
+    if unit is None or (unit == 365 * DAY and calendar != "noleap"):
         return None
     try:
         epoch, _ = instants(match[2], calendar)
@@ -161,9 +171,11 @@ def in_days(
     """Finite times in days since their date, and the units and the calendar of these.
 
     A whole month or year leads to the same day of a later month, or to its last day; a fraction is
-    a share of the month in which it lies. None where the units and the calendar name no date.
+    a share of the month in which it lies. Dates that are written as numbers, "day as %Y%m%d.%f",
+    are counted since the first of them. None where the units and the calendar name no date.
     """
-    match = SINCE.fullmatch(str(attributes.get("units", "")))
+    units = str(attributes.get("units", ""))
+    match = SINCE.fullmatch(units)
     calendar = CALENDARS.get(str(attributes.get("calendar") or "standard").strip().lower())
     known, months = clock(attributes), None if match is None else MONTH_UNITS.get(match[1].lower())
     try:
@@ -173,12 +185,48 @@ def in_days(
         elif match is not None and months is not None and calendar is not None:
             days = Clock(unit=DAY, epoch=instants(match[2], calendar)[0], calendar=calendar)
             exact = [_months_later(days, Fraction(value) * months) for value in values]
+        elif (written := NUMERIC.fullmatch(units)) is not None and calendar and values:
+            exact = [Fraction(_of_digits(value, written, calendar)) for value in values]
+            epoch = int(exact[0]) // DAY * DAY
+            days = Clock(unit=DAY, epoch=epoch, calendar=calendar)
         else:
             return None
     except InputError:
         return None
     units = f"days since {date_text(days.epoch, days.calendar).replace('T', ' ')}"
     return [days.value(each) for each in exact], {"units": units, "calendar": days.calendar}
+
+
+def is_numeric_date(units: str) -> bool:
+    """Whether units say that the digits of a time are those of a date; see NUMERIC."""
+    return NUMERIC.fullmatch(units) is not None
+
+
+def _of_digits(value: float, form: re.Match[str], calendar: str) -> int:
+    """The instant of a date that is written as a number; InputError for one that is no date.
+
+    It is that of a whole second where float64 cannot tell the two apart.
+    """
+    digits, share = divmod(Fraction(abs(value)), 1)
+    number = int(digits)
+    day = month = 1
+    if form["day"] or form["dd"]:
+        number, day = divmod(number, 100)
+    if form["month"] or form["mm"]:
+        number, month = divmod(number, 100)
+    year = -number if value < 0 else number
+    if not 1 <= month <= 12 or not 1 <= day <= days_of_month(year, month, calendar):
+        raise InputError(f"{value:.12g} is no date of the calendar {calendar}")
+    first = day_number(year, month, day, calendar)
+    after = first + 1
+    if not (form["day"] or form["dd"]):
+        whole = not (form["month"] or form["mm"])
+        later = (year + 1, 1) if whole or month == 12 else (year, month + 1)
+        after = day_number(*later, 1, calendar)
+    instant = round((first + share * (after - first)) * DAY)
+    second = round(Fraction(instant, SECOND)) * SECOND
+    blurred = 2 * Fraction(math.ulp(value)) * (after - first) * DAY
+    return second if abs(second - instant) <= blurred else instant
 
 
 def _months_later(start: Clock, months: Fraction) -> Fraction:

@@ -101,7 +101,7 @@ def test_lists_that_are_no_series(
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MissingInputError, match=r"run\.pvd lists .*gone\.vti, which is not there"):
+    with pytest.raises(MissingInputError, match=r"run\.pvd names .*gone\.vti, which is not there"):
         open_series(pvd(tmp_path, (0, 0, "gone.vti")))
 
 
@@ -324,7 +324,7 @@ def test_padding_behind_the_size_is_taken(tmp_path: Path) -> None:
     [
         ({"grid": 'Direction="0 1 0 1 0 0 0 0 1"'}, "turned against the axes"),
         ({"values": "0 1 2"}, "5 bytes of text, not 6 values"),
-        ({"values": "0 1 2 3 4 5 6"}, "7 values, not 6"),
+        ({"values": "0 1 2 3 4 5 6"}, "7 numbers, 6 are needed"),
         ({"values": "0 1 2 3 4 x"}, "x"),
         ({"values": "0 1 2 3 4 " + "1" * 100}, "text stands where numbers are needed"),
         ({"array": 'NumberOfComponents="0"'}, "'0' components"),

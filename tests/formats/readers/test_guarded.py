@@ -1,0 +1,196 @@
+"""Readers go by the bytes that are there, and open other files through one gate."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import h5py
+import nibabel
+import numpy as np
+import pytest
+import segyio
+import tifffile
+import zarr
+
+from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.registry import list_variables, open_series
+from fhash_formats.readers.stored_bytes import numbers_in_text
+
+SOURCES = Path(__file__).parents[2] / "hard" / "fuzz" / "sources"
+"""Sound files of each format that this project reads itself."""
+LISTS = {"run.pvd", "run.vti.series", "whole.pvti", "files.nhdr"}
+"""Those that name other files."""
+OWN = sorted(path.name for path in SOURCES.iterdir())
+NUMBERS = np.arange(60, dtype="f4").reshape(3, 4, 5)
+
+
+def read_all(path: Path) -> None:
+    """Read each variable of a file that can be one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FhashWarning)
+        listed = list_variables(path)
+        for each in listed:
+            var = each.name if len(listed) > 1 else None
+            if not each.problem and len(each.options) == 1:
+                with open_series(path, var=var) as series:
+                    series.read(series.shape[0] - 1)
+
+
+@pytest.mark.parametrize("name", [name for name in OWN if name not in LISTS])
+def test_sound_files_are_read_and_cut_ones_are_told(tmp_path: Path, name: str) -> None:
+    path, data = tmp_path / name, (SOURCES / name).read_bytes()
+    path.write_bytes(data)
+    read_all(path)
+    for share in (0.4, 0.8):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(InputError, match=r"cut|need exactly") as caught:
+            read_all(path)
+        assert "\n" not in str(caught.value)
+
+
+def write_hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("v", data=NUMBERS, chunks=(1, 4, 5), compression="gzip")
+
+
+def write_segy(path: Path) -> None:
+    spec = segyio.spec()
+    spec.sorting, spec.format, spec.samples = 2, 5, np.arange(4) * 4.0
+    spec.ilines, spec.xlines = [1, 2], [5, 6]
+    with segyio.create(path, spec) as file:
+        for number in range(4):
+            file.header[number] = {189: number // 2 + 1, 193: number % 2 + 5}
+            file.trace[number] = np.zeros(4, "f4")
+
+
+def write_zip(path: Path) -> None:
+    with zarr.storage.ZipStore(path, mode="w") as store:
+        array = zarr.create_array(store, shape=NUMBERS.shape, dtype="f4", chunks=(1, 4, 5))
+        array[...] = NUMBERS
+
+
+CUT = {
+    "a.h5": write_hdf5,
+    "a.nc": write_hdf5,
+    "a.sgy": write_segy,
+    "a.zip": write_zip,
+    "a.tif": lambda path: tifffile.imwrite(path, NUMBERS, photometric="minisblack"),
+    "b.tif": lambda path: tifffile.imwrite(
+        path, NUMBERS, photometric="minisblack", compression="zlib"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CUT)
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_cut_files_of_libraries_are_told(tmp_path: Path, name: str, share: float) -> None:
+    path = tmp_path / name
+    CUT[name](path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError, match="cut") as caught:
+        read_all(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_nifti_without_an_affine_is_read(tmp_path: Path) -> None:
+    """Its header of 64-bit numbers, as NIfTI-2 has it, was one that nobody may change."""
+    image = nibabel.Nifti2Image(NUMBERS.T, None)
+    image.header["pixdim"][1:4] = [2, 3, 4]
+    image.to_filename(tmp_path / "a.nii")
+    with open_series(tmp_path / "a.nii") as series:
+        np.testing.assert_array_equal(series.read(0), NUMBERS)
+        assert series.coords["x"].values[:2].tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Pair, nibabel.Nifti2Pair])
+def test_compressed_pairs_of_nifti(tmp_path: Path, kind: Any) -> None:
+    kind(NUMBERS.T, np.eye(4)).to_filename(tmp_path / "a.img.gz")
+    with open_series(tmp_path / "a.hdr.gz") as series:
+        np.testing.assert_array_equal(series.read(0), NUMBERS)
+
+
+def nifti_pair(folder: Path, outside: Path) -> str:
+    nibabel.Nifti1Pair(NUMBERS.T, np.eye(4)).to_filename(folder / "a.img")
+    shutil.move(folder / "a.img", outside / "a.img")
+    (folder / "a.img").symlink_to(outside / "a.img")
+    return "a.hdr"
+
+
+def nrrd_header(folder: Path, outside: Path) -> str:
+    (outside / "a.raw").write_bytes(NUMBERS.tobytes())
+    (folder / "a.nhdr").write_text(
+        "NRRD0004\ntype: float\ndimension: 3\nsizes: 5 4 3\nendian: little\nencoding: raw\n"
+        f"data file: ../{outside.name}/a.raw\n"
+    )
+    return "a.nhdr"
+
+
+def pieces(folder: Path, outside: Path) -> str:
+    shutil.copy(SOURCES / "ascii.vti", outside / "a.vti")
+    text = (SOURCES / "whole.pvti").read_text()
+    (folder / "a.pvti").write_text(text.replace("a.vti", f"../{outside.name}/a.vti"))
+    return "a.pvti"
+
+
+def collection(folder: Path, outside: Path) -> str:
+    shutil.copy(SOURCES / "ascii.vti", outside / "a.vti")
+    text = (SOURCES / "run.pvd").read_text()
+    (folder / "a.pvd").write_text(re.sub(r"[ab]\.vti", f"../{outside.name}/a.vti", text))
+    return "a.pvd"
+
+
+def pages(folder: Path, outside: Path) -> str:
+    for number in (0, 1):
+        tifffile.imwrite(outside / f"s{number}.tif", NUMBERS[number])
+        (folder / f"s{number}.tif").symlink_to(outside / f"s{number}.tif")
+    return "s*.tif"
+
+
+def array_of_a_group(folder: Path, outside: Path) -> str:
+    """An array whose positions are in a neighbour: a link to a folder elsewhere."""
+    group = zarr.open_group(folder / "g.zarr", mode="w", zarr_format=2)
+    array = group.create_array("v", shape=NUMBERS.shape, dtype="f4")
+    array[...] = NUMBERS
+    array.attrs["_ARRAY_DIMENSIONS"] = ["z", "y", "x"]
+    line = zarr.create_array(outside / "z", shape=(3,), dtype="f4", zarr_format=2)
+    line[...] = [1, 2, 3]
+    line.attrs["_ARRAY_DIMENSIONS"] = ["z"]
+    (folder / "g.zarr" / "z").symlink_to(outside / "z")
+    return "g.zarr/v"
+
+
+@pytest.mark.parametrize(
+    "write", [nifti_pair, nrrd_header, pieces, collection, pages, array_of_a_group]
+)
+def test_no_reader_leaves_the_folder_of_its_file(tmp_path: Path, write: Any) -> None:
+    inside, outside = tmp_path / "in", tmp_path / "out"
+    inside.mkdir()
+    outside.mkdir()
+    place = inside / write(inside, outside)
+    wishes: dict[str, Any] = {"axes": "z,y,x"} if write is pages else {}
+    if write in (pieces, collection):
+        wishes["var"] = "n"
+    open_series(place, **wishes).close()
+    with pytest.raises(InputError, match="outside its folder"):
+        open_series(place, no_external=True, **wishes)
+
+
+def test_numbers_in_text_are_read_in_parts(tmp_path: Path) -> None:
+    """A number may lie across two parts."""
+    values = np.random.default_rng(0).normal(size=120_000)
+    path = tmp_path / "a.txt"
+    path.write_text(", ".join(map(repr, values.tolist())))
+    size = path.stat().st_size
+    assert size > 2 << 20
+    with path.open("rb") as file:
+        found = numbers_in_text(file, size, np.dtype("f8"), len(values))
+        np.testing.assert_array_equal(found, values)
+        for count in (len(values) - 1, len(values) + 1):
+            file.seek(0)
+            with pytest.raises(InputError, match="120000 numbers"):
+                numbers_in_text(file, size, np.dtype("f8"), count)
