@@ -65,9 +65,7 @@ _TILES: Prototypes = {
     "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
     "fhash_tile_free": (ARRAY,),
     "fhash_tile_bound": (ARRAY,),
-    "fhash_tile_encode": (
-        *_TILE, *(ARRAY,) * 3, ctypes.c_int32, ARRAY, ctypes.c_size_t, ARRAY, ARRAY,
-    ),
+    "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),
 }
 """Functions of fhash.h and part.cpp, whose result is an int32."""
 _RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.c_size_t}

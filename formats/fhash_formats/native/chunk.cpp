@@ -116,6 +116,7 @@ struct Task {
     Wide origin;
     double low, high;      // of the other values, less the origin
     int64_t whole_low, whole_high;  // the same, of integers
+    double ends[2];        // likewise, of the range that a relative bound is of
     double error, reach;   // bound on decoded values, below 0 for none; and before they are rounded
     bool signed_zero;      // a zero has a sign, or a value is below 0
 
@@ -256,6 +257,25 @@ template <class O> void set_origin(Task& task, O low, O high) {
     }
 }
 
+// The range that a relative bound is of: without 0, which stores put where nothing was written.
+template <class O> void set_ends(Task& task, const O* values) {
+    const auto number = [&](const O& value) {
+        if constexpr (is_real<O>) return real(value);
+        else return task.origin.zero() ? real(value)
+                                       : (double)(int64_t)((uint64_t)value - task.origin.bits);
+    };
+    bool any = false;
+    task.ends[0] = task.ends[1] = 0;
+    for (int64_t i = 0; i < task.size(); i++) {
+        if (value_of(values[i]) == 0 || (!task.marks.of.empty() && task.marks.of[(size_t)i]))
+            continue;
+        const double value = number(values[i]);
+        if (!any || value < task.ends[0]) task.ends[0] = value;
+        if (!any || value > task.ends[1]) task.ends[1] = value;
+        any = true;
+    }
+}
+
 // Range of the values that are not marked; false where all are.
 template <class O> bool survey(Task& task, const O* values) {
     bool any = false;
@@ -275,6 +295,7 @@ template <class O> bool survey(Task& task, const O* values) {
     } else {
         set_origin(task, low, high);
     }
+    if (task.quality.max_error_rel > 0) set_ends(task, values);
     return true;
 }
 
@@ -286,9 +307,9 @@ void set_bound(Task& task) {
     if (quality.step > 0) return;
     task.error = std::max(quality.max_error, 0.0);
     if (quality.max_error_rel > 0) {
-        const double fraction = quality.max_error_rel, span = task.high - task.low;
+        const double fraction = quality.max_error_rel, span = task.ends[1] - task.ends[0];
         task.error = std::isfinite(span) ? fraction * span
-                                         : fraction * task.high - fraction * task.low;
+                                         : fraction * task.ends[1] - fraction * task.ends[0];
     }
     if (task.whole()) {
         task.reach = std::floor(task.error) + 0.5;
@@ -533,18 +554,19 @@ bool check_quality(const fhash_quality* quality, fhash_error& error) {
 }  // namespace
 
 bool encode_quality(fhash_context& context, const fhash_tile* tile, const void* values,
-                    const fhash_quality* quality, const void* missing, int32_t count, Coded& coded,
+                    const fhash_quality* quality, const void* missing, Coded& coded,
                     fhash_error& error) {
     if (!tile || !values || !is_shape(tile->shape) || !fhash_type_size(tile->type) ||
         tile->settings)
         return fail(error, FHASH_ERROR_ARGUMENT,
                     "a tile to encode has values, a type, four lengths, and no settings");
     if (!check_quality(quality, error)) return false;
-    if (count < 0 || (count && !missing) || count > MAX_MISSING)
-        return fail(error, FHASH_ERROR_ARGUMENT, "%d missing values; 0 to %d are possible", count,
-                    MAX_MISSING);
+    const int32_t count = missing ? std::max(quality->missing, 1) : 0;
+    if (quality->missing < 0 || count > MAX_MISSING)
+        return fail(error, FHASH_ERROR_ARGUMENT, "%d missing values; at most %d are possible",
+                    quality->missing, MAX_MISSING);
     Task task = {context, {}, tile->type, (const uint8_t*)values, *quality, {}, {}, 0, 0, 0, 0,
-                 -1, 0, false};
+                 {0, 0}, -1, 0, false};
     std::copy_n(tile->shape, 4, task.shape.begin());
     if (!may_use(context, 96 * (uint64_t)task.size(), error)) return false;
     bool kept = true;
@@ -576,14 +598,13 @@ size_t fhash_tile_bound(const fhash_tile* tile) {
 }
 
 int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const void* values,
-                          const fhash_quality* quality, const void* missing, int32_t count,
-                          void* stream, size_t room, size_t* size, fhash_error* error) {
+                          const fhash_quality* quality, const void* missing, void* stream,
+                          size_t room, size_t* size, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         Coded coded;
         if (!context || !size)
             return fail(failed, FHASH_ERROR_ARGUMENT, "a context and a size are needed");
-        if (!encode_quality(*context, tile, values, quality, missing, count, coded, failed))
-            return false;
+        if (!encode_quality(*context, tile, values, quality, missing, coded, failed)) return false;
         *size = coded.data.size();
         if (*size > room || !stream)
             return fail(failed, FHASH_ERROR_SIZE, "the stream has %zu bytes, the room %zu", *size,

@@ -101,26 +101,26 @@ FHASH_API int32_t fhash_tile_decode(fhash_context* context, const fhash_tile* ti
 /* A promise for the values of a tile: exactly one of the three numbers is above 0, or max_error is 0 (every bit). */
 typedef struct fhash_quality {
     double max_error;     /* bound on |decoded - value| in the units of the values; below 0 for none */
-    double max_error_rel; /* the same as a share of the range of the tile's values; 0 for none */
+    double max_error_rel; /* the same as a share of the range of the tile's values without 0, missing ones; 0 for none */
     double step;          /* step of the quantiser, without a bound; 0 for none */
     int32_t effort;       /* 1, the fastest, to 9 */
     int32_t transform_given; /* 0: the transform that codes best in a trial; 1: `transform` */
     uint8_t transform[4]; /* along t, z, y, x: 0 for none, else 16 (Haar), 32 (5/3) or 48 (9/7) plus levels, 1 to 10 */
-    int32_t reserved;     /* 0 */
+    int32_t missing;      /* values that the caller calls missing, at most 16; 0 counts as 1 */
 } fhash_quality;
 
 /* Encode a tile, with settings of its own in the stream. tile->settings is NULL.
  *
- * missing: NULL, or `count` values of the tile's type, at most 16, that stand where there is none, such as fill values
- *     of a store. They come back bit by bit, as NaN and infinities do, and take no part in range and bound; so do values
+ * missing: NULL, or quality->missing values of the tile's type that stand where there is none, such as fill values of a
+ *     store. They come back bit by bit, as NaN and infinities do, and take no part in range and bound; so do values
  *     farther from all others than these are from each other, and planes of zeros, which stores have where nothing was
  *     written.
  * stream: room of `room` bytes, or NULL.
  * size: gets the bytes of the stream, also where it does not fit (FHASH_ERROR_SIZE); fhash_tile_bound says how many
  *     are enough. */
 FHASH_API int32_t fhash_tile_encode(fhash_context* context, const fhash_tile* tile, const void* values,
-                                    const fhash_quality* quality, const void* missing, int32_t count, void* stream,
-                                    size_t room, size_t* size, fhash_error* error);
+                                    const fhash_quality* quality, const void* missing, void* stream, size_t room,
+                                    size_t* size, fhash_error* error);
 
 /* Bytes that are enough for any stream of a tile of this shape and type. */
 FHASH_API size_t fhash_tile_bound(const fhash_tile* tile);

@@ -421,8 +421,9 @@ size_t encode(const Chunk& chunk, const unsigned* numbers, size_t given, size_t*
             value[big_endian_machine() ? chunk.each - 1 - i : i] = (uint8_t)(bits >> 8 * i);
     }
     size_t coded = 0;
-    if (fhash_tile_encode(own.context, &chunk.tile, values, &quality, missing.data(),
-                          (int32_t)count, stream.data, room, &coded, &error)) {
+    quality.missing = (int32_t)count;
+    if (fhash_tile_encode(own.context, &chunk.tile, values, &quality,
+                          count ? missing.data() : nullptr, stream.data, room, &coded, &error)) {
         return 0;
     }
     std::swap(stream.data, *buffer);

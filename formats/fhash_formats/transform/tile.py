@@ -83,7 +83,7 @@ class _Quality(ctypes.Structure):
         ("effort", ctypes.c_int32),
         ("transform_given", ctypes.c_int32),
         ("transform", ctypes.c_uint8 * 4),
-        ("reserved", ctypes.c_int32),
+        ("missing", ctypes.c_int32),
     )
 
 
@@ -290,9 +290,10 @@ def encode_for(tile: Values, quality: tuple[Any, ...], missing: Values) -> bytes
     t, z, y, x = tile.shape
     of = _tile((t, z, y, x), tile.dtype, None)
     room = np.empty(native.library().fhash_tile_bound(ctypes.byref(of)), np.uint8)
-    asked, size = _Quality(*numbers, (ctypes.c_uint8 * 4)(*transform)), ctypes.c_size_t()
+    asked = _Quality(*numbers, (ctypes.c_uint8 * 4)(*transform), missing.size)
+    size = ctypes.c_size_t()
     results = (_pointer(room), room.size, ctypes.byref(size))
-    given = (ctypes.byref(asked), _pointer(missing), missing.size)
+    given = (ctypes.byref(asked), _pointer(missing) if missing.size else None)
     _call("fhash_tile_encode", of, _pointer(tile), *given, *results)
     return room[: size.value].tobytes()
 

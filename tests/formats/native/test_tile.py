@@ -50,7 +50,7 @@ class Quality(ctypes.Structure):
         ("effort", ctypes.c_int32),
         ("transform_given", ctypes.c_int32),
         ("transform", ctypes.c_uint8 * 4),
-        ("reserved", ctypes.c_int32),
+        ("missing", ctypes.c_int32),
     )
 
 
@@ -63,7 +63,7 @@ for _name, _result, *_arguments in (
     ("fhash_context_destroy", None, POINTER),
     ("fhash_tile_bound", SIZE, POINTER),
     ("fhash_tile_decode", INT, *(POINTER,) * 3, SIZE, INT, *(POINTER,) * 3),
-    ("fhash_tile_encode", INT, *(POINTER,) * 5, INT, POINTER, SIZE, *(POINTER,) * 2),
+    ("fhash_tile_encode", INT, *(POINTER,) * 6, SIZE, *(POINTER,) * 2),
 ):
     _function = getattr(LIBRARY, _name)
     _function.restype, _function.argtypes = _result, _arguments
@@ -85,15 +85,14 @@ def encode(context: int | None, values: Values, room: int = 1 << 16, **given: An
     """Status, text, size and bytes of a stream; given: fields of the quality, `missing`, `tile`."""
     tile = given.pop("tile", tile_of(values.shape, values.dtype))
     missing = np.asarray(given.pop("missing", ()), values.dtype)
-    quality = Quality(**{"max_error": -1.0, "effort": 2, **given})
+    quality = Quality(**{"max_error": -1.0, "effort": 2, "missing": len(missing), **given})
     error, size, stream = Error(), SIZE(), ctypes.create_string_buffer(max(room, 1))
     status = LIBRARY.fhash_tile_encode(
         context,
         ctypes.byref(tile),
         values.ctypes.data,
         ctypes.byref(quality),
-        missing.ctypes.data,
-        len(missing),
+        missing.ctypes.data if len(missing) else None,
         stream,
         room,
         ctypes.byref(size),
