@@ -99,19 +99,20 @@ def test_what_does_not_fit_changes_nothing(run) -> None:
     place = {"x": Coordinate(name="x", values=np.arange(12) + 1.0)}
     hours = {"t": Coordinate(name="t", values=np.arange(3) + 9.0, attributes={"units": "h"})}
     for source, message in (
-        (frames(6, 9)[:, :, :9], r"has shape \(z, y, x\)"),
-        (frames(6, 9).astype("f8"), "has number type float64"),
+        (frames(6, 9)[:, :, :9], r"has a frame \(z, y, x\) of shape \(4, 9, 12\)"),
+        (frames(6, 9).astype("f8"), "has values of type float64"),
         (with_gap(frames(6, 12)), "step 4 has values that are missing"),
-        (ArraySeries(frames(6, 9), coords=place), "has positions 1 to 12 along x"),
+        (ArraySeries(frames(6, 9), coords=place), "has positions along x: 1 to 12, .* 0 to 11"),
         (run, "is encoded already"),
     ):
         with pytest.raises(InputError, match=message):
             append(source, run)
         assert run.read_bytes() == before
         assert os.listdir(run.parent) == ["run.fhz"]
-    # Units that only one of the two has are no contradiction.
+    # Units that only one of the two has are no contradiction, but hours are no numbers of steps.
+    with pytest.raises(InputError, match="has times in 'h', and .* has none but the numbers"):
+        append(ArraySeries(frames(6, 9), coords=hours), run)
     append(metres, run, keep=3)
-    append(ArraySeries(frames(6, 9), coords=hours), run)
 
 
 def test_a_failure_while_steps_are_coded_changes_nothing(run) -> None:
@@ -261,7 +262,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
         writer.append(good)
         for wrong, time_of_step, message in (
             (good[:, :-1], None, r"step 1: the frame has shape \(4, 9, 12\)"),
-            (bad, None, "step 1: 2 of its values are NaN or infinite"),
+            (bad, None, "step 1: 2 of its values are missing or infinite"),
             (good.astype("f8"), None, "step 1: the frame is float64, those before are float32"),
             (good.astype(complex), None, "complex128 cannot be encoded"),
             (good, 0.0, "step 1: its time is 0, the one before has 0.0; times must"),
