@@ -23,6 +23,7 @@ from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import OVERHEAD_BYTES, plan
 from fhash_codec.compact.tiles import Blocks
 from fhash_codec.config import EncodeConfig
+from fhash_codec.features.scan import Extremes
 from fhash_codec.features.selection import Source, open_source, select_features
 from fhash_codec.header import check_name
 from fhash_codec.measure.value_range import ValueRange
@@ -33,6 +34,7 @@ from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.belonging import (
     Labels,
     counted_times,
+    is_index,
     require_alike,
     require_same_grid,
 )
@@ -49,7 +51,12 @@ from fhash_formats.series import (
 )
 from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.support.values import as_array, exact_number, json_attributes
+from fhash_formats.support.values import (
+    as_array,
+    exact_number,
+    is_wide_integer,
+    json_attributes,
+)
 
 
 def bound_of(config: EncodeConfig, value_range: ValueRange | None) -> float:
@@ -254,7 +261,7 @@ class Writer:
         self._begin(Path(path), (z, y, x))
         self._stack, self._file = stack, growing
         with open_volume(path) as volume:
-            self._labels = labels_of_file(volume)
+            self._labels = _labels_of(volume)
         self._dtype = growing.coder.dtype
         self._last = growing.times[-1]
         return self
@@ -519,45 +526,43 @@ def _add(
 ) -> None:
     """Code all steps of a series, layer by layer."""
     layer, steps = growing.coder.tile[0], series.shape[0]
+    extremes = Extremes(series.dtype, series.unlikely)
     with thread_pool() as workers:
         for first in range(0, steps, layer):
             span = range(first, min(first + layer, steps))
-            frames = [_frame(series, step) for step in span]
+            frames = [_frame(series, step, growing.coder.dtype) for step in span]
+            for frame in frames:
+                extremes.add(frame, frame.size, frame.min().item(), frame.max().item())
             coded = growing.coder.code(frames, growing.figures, workers)
             growing.add(coded, times[span.start : span.stop].tolist(), publish=False)
             progress("appending", span.stop, steps, "")
+    extremes.refuse(series)
 
 
-def _frame(series: Series, step: int) -> npt.NDArray[Any]:
-    """A frame; raises InputError for one with missing values."""
+def _frame(series: Series, step: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """A frame in the type of the file; raises InputError for one with missing values."""
     frame = series.read(step)
     if frame.dtype.kind == "f" and not np.isfinite(frame).all():
         raise InputError(
             f"{series.source}: step {step} has values that are missing or infinite; a file that "
             "grows has none: encode these data as a file of their own"
         )
-    return frame
+    if frame.dtype.kind == "f" and is_wide_integer(dtype) and np.abs(frame).max() > 1 << 53:
+        raise InputError(
+            f"{series.source}: step {step} has integers beyond 2^53, which a declared fill value "
+            "makes floats of: they are rounded; --raw-values reads them as they are stored"
+        )
+    return frame.astype(dtype, copy=False)
 
 
-def labels_of_file(volume: Volume) -> Labels:
-    """The labels of a file; positions that are counted from 0, and say no more, are not given."""
-    coords = volume.coords
-    return Labels(
-        source=str(volume.path),
-        name="" if volume.name == UNNAMED else volume.name,
-        units=volume.units,
-        attributes=volume.attrs,
-        shape=volume.shape[1:],
-        dtypes=(volume.info["variable"]["dtype"],),
-        coords=coords,
-        given={axis for axis, each in coords.items() if each.attributes or not _is_index(each)},
-    )
+def _labels_of(volume: Volume) -> Labels:
+    return Labels.of_file(volume.path, volume.container.header, volume.coords)
 
 
 def _require_same(series: Series, volume: Volume) -> None:
     """Raise InputError unless a series is more of what a volume is."""
     labels = Labels.of(series)
-    require_alike(replace(labels, dtypes=labels.dtypes[1:]), labels_of_file(volume))
+    require_alike(replace(labels, dtypes=labels.dtypes[1:]), _labels_of(volume))
     require_same_grid(series.metadata, volume.metadata, (series.source, str(volume.path)))
 
 
@@ -589,10 +594,10 @@ def _counted_as_in(
 ) -> npt.NDArray[np.float64]:
     """Times counted as those of a file; raises InputError where they cannot be compared."""
     here, there = own.attributes.get("units"), before.attributes.get("units")
-    if here and not there and _is_index(before):
+    if here and not there and is_index(before):
         raise InputError(
             f"{what} has times in '{here}', and {path} has none but the numbers of its steps; "
-            "give it times in these units, or give the data without"
+            "give it times in such units (time_units), or give the data without times"
         )
     if not (here and there):
         return own.values
@@ -604,14 +609,14 @@ def _times_after(what: str, before: Coordinate, count: int) -> npt.NDArray[np.fl
     steps = np.diff(before.values)
     even = steps.size and steps[0] > 0 and np.allclose(steps, steps[0], rtol=EVEN, atol=0)
     told = before.attributes.get("units")
-    if not even and not _is_index(before):
+    if not even and not is_index(before):
         raise InputError(
             f"{what} has no times, and those of the file, which ends at {before.values[-1]:.9g}, "
             "have no even distance; give the data with times"
         )
     step = float(steps[0]) if steps.size else 1.0
     times: npt.NDArray[np.float64] = before.values[-1] + step * np.arange(1, count + 1)
-    if told or not _is_index(before):
+    if told or not is_index(before):
         warnings.warn(
             f"{what} has no times: its steps go on from {times[0]:.9g} to {times[-1]:.9g}, as far "
             f"apart as those before{f', in {told!r}' if told else ''}",
@@ -623,8 +628,3 @@ def _times_after(what: str, before: Coordinate, count: int) -> npt.NDArray[np.fl
 
 EVEN = 1e-6
 """Share by which distances of times that are even may differ, as float64 rounds them."""
-
-
-def _is_index(coordinate: Coordinate) -> bool:
-    """Whether positions are those of an axis without any: counted from 0."""
-    return np.array_equal(coordinate.values, np.arange(coordinate.values.size))

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, Coordinate, Series, SourceMetadata
+from fhash_formats.series import AXES, UNNAMED, Coordinate, Series, SourceMetadata
 from fhash_formats.support.dates import (
     CALENDARS,
     DAY,
@@ -39,6 +39,7 @@ LOSS = Fraction(1, 10**6)
 """Largest change of a time that is counted anew, as a share of the distance of two times."""
 OWN_FILE = "or encode it as a file of its own"
 
+Coords = Mapping[str, Coordinate]
 Parts = Sequence[tuple[Path, Coordinate]]
 
 
@@ -66,7 +67,7 @@ class Labels:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     shape: Sequence[int] = ()
     dtypes: Sequence[str] = ()
-    coords: Mapping[str, Coordinate] = field(default_factory=dict)
+    coords: Coords = field(default_factory=dict)
     given: Collection[str] = AXES[1:]
 
     @classmethod
@@ -86,6 +87,27 @@ class Labels:
             coords=series.coords,
             given=series.given,
         )
+
+    @classmethod
+    def of_file(cls, path: object, header: Mapping[str, Any], coords: Coords) -> Labels:
+        """The labels of a container; positions that are counted from 0 and say no more are not
+        given."""
+        variable = header["variable"]
+        return cls(
+            source=str(path),
+            name="" if variable["name"] == UNNAMED else variable["name"],
+            units=variable["units"],
+            attributes=variable["attributes"],
+            shape=tuple(header["domain"]["shape"][1:]),
+            dtypes=(variable["dtype"],),
+            coords=coords,
+            given={axis for axis, each in coords.items() if each.attributes or not is_index(each)},
+        )
+
+
+def is_index(coordinate: Coordinate) -> bool:
+    """Whether positions are those of an axis without any: counted from 0."""
+    return np.array_equal(coordinate.values, np.arange(coordinate.values.size))
 
 
 def require_alike(one: Labels, other: Labels) -> None:
