@@ -231,15 +231,8 @@ class Writer:
             )
 
         self._new_file = new_file
-        self._labels = Labels(
-            source=str(path),
-            name="" if name == UNNAMED else str(name),
-            units=str(units),
-            attributes=variable["attributes"],
-            shape=frame,
-            coords=positions,
-            given=set(coords or {}),
-        )
+        told = {"variable": {**variable, "dtype": ""}, "domain": {"shape": (1, *frame)}}
+        self._labels = Labels.of_file(path, told, positions)
         tile = parse_tile(settings.tile, (MAX_STEPS, *frame))
         self._tile_steps = None if tile is None or tile[0] == MAX_STEPS else tile[0]
         self._begin(path, frame)

@@ -46,8 +46,11 @@ def as_array(array: Any, what: str = "array") -> npt.NDArray[Any]:
     try:
         if hasattr(array, "__dlpack__") and not hasattr(array, "__array__"):
             array = np.from_dlpack(array)
-        hidden = isinstance(array, list | tuple) and any(each is np.ma.masked for each in array)
-        values = np.ma.array(array) if hidden else np.asanyarray(array)
+        mask = [each is np.ma.masked for each in array] if isinstance(array, list | tuple) else []
+        if any(mask):
+            shown = [0 if gone else each for gone, each in zip(mask, array, strict=True)]
+            array = np.ma.array(shown, mask=mask)
+        values = np.asanyarray(array)
     except (TypeError, ValueError, RuntimeError, BufferError) as error:
         told = " ".join(str(error).split())[:200]
         raise InputError(f"{what}: it cannot become an array of numpy: {told}") from error
