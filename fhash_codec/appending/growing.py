@@ -339,7 +339,7 @@ class GrowingFile:
         mark = self._container.mark()
         names = self._name(self._array.frame)
         self._container.describe(self._array, self.steps)
-        coords = {**self._coords, "t": self._time()}
+        coords = {**self._coords, "t": self.time}
         described = describe_coordinates(coords, names)
         write_coordinates(self._container, coords, described)
         self._container.publish(self._full_header(described), mark)
@@ -350,7 +350,9 @@ class GrowingFile:
         coordinates = [self._coords[axis].name for axis in AXES]
         return self._container.name_axes(coordinates, (self.steps, *frame))
 
-    def _time(self) -> Coordinate:
+    @property
+    def time(self) -> Coordinate:
+        """The times of the steps that were added."""
         known = self._coords["t"]
         values = np.array(self._times, dtype=np.float64)
         return Coordinate(name=known.name, values=values, attributes=known.attributes)

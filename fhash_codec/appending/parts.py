@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple, TypedDict, overload
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.series_plan import SeriesPlan, bounded, code_layers
+from fhash_codec.appending.series_plan import DIGESTS, SeriesPlan, bounded, code_layers
 from fhash_codec.compact.encode import all_tiles
 from fhash_codec.compact.tiles import Blocks, CodedTiles
 from fhash_codec.comparison import Report, measure, report, ssim_budget, steps_of_ssim
@@ -43,6 +43,7 @@ from fhash_formats.container.header import EVERYTHING, NOT_STORED, TABLE
 from fhash_formats.container.record import Record
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.readers.belonging import Labels, require_alike
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series, StepsSeries
 from fhash_formats.support.files import check_output, many_files
 from fhash_formats.support.threads import thread_pool
@@ -202,6 +203,7 @@ class _Job:
                 "size": coded.outcome.size,
                 "nonzero": coded.outcome.nonzero,
                 "ssim_steps": whole,
+                "series": [self.plan.labels[name] for name in DIGESTS],
             }
             writer.commit(header)
         return quality
@@ -424,6 +426,12 @@ class _Piece:
             raise DamagedFileError(f"{self.path}: array {ERRORS} has numbers that are no errors")
 
     @cached_property
+    def labels(self) -> Labels:
+        """What tells its series from others."""
+        coords = {axis: self.container.coordinate(AXIS_NAMES[axis]) for axis in AXES}
+        return Labels.of_file(self.path, self.container.header, coords)
+
+    @cached_property
     def shared(self) -> dict[str, Any]:
         """The keys and settings that all parts of a series have in common."""
         header = self.container.header
@@ -445,6 +453,7 @@ class _Piece:
             "settings": self.settings.to_bytes(),
             "positions": [(c.name, c.attributes, c.values.tobytes()) for c in positions],
             "time": (time.name, time.attributes),
+            "series": header[PART].get("series"),
             "parts": (self.of, self.steps, self.ssim_steps),
         }
 
@@ -467,6 +476,7 @@ def _require_whole(parts: Sequence[_Piece]) -> None:
         raise InputError("no parts are given; name the files of fhash encode --part")
     first, end = parts[0], 0
     for part in parts:
+        require_alike(part.labels, first.labels)
         different = [name for name, value in part.shared.items() if first.shared.get(name) != value]
         if different or part.shared.keys() != first.shared.keys():
             what = different[0] if different else "header"

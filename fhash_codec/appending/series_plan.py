@@ -43,7 +43,7 @@ from fhash_formats.errors import (
 from fhash_formats.series import AXES, Series
 from fhash_formats.support.files import check_output, replacing
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.support.values import plain_json
+from fhash_formats.support.values import json_attributes, plain_json
 from fhash_formats.transform.tile import DENSITIES
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
@@ -246,7 +246,7 @@ class SeriesPlan:
         """Raise InputError unless the labels of a series are those of the plan."""
         for name, value in _labels(series).items():
             if self.labels.get(name) != value:
-                told = "" if name == "coordinates" else f": {self.labels.get(name)}, not {value}"
+                told = "" if name in DIGESTS else f": {self.labels.get(name)}, not {value}"
                 raise InputError(
                     f"the plan is of other data than {series.source}, they differ in {name}{told}; "
                     "give the same data and the same --var, --axes, --t, or make the plan anew"
@@ -390,6 +390,10 @@ def bounded(config: EncodeConfig) -> EncodeConfig:
     return replace(config, timings=False)
 
 
+DIGESTS = ("coordinates", "attributes")
+"""Labels of which a plan keeps a digest alone."""
+
+
 def _labels(series: Series) -> dict[str, Any]:
     """The labels by which a series is told from another one; JSON values."""
     digest = hashlib.sha256()
@@ -397,13 +401,21 @@ def _labels(series: Series) -> dict[str, Any]:
         coordinate = series.coords[axis]
         digest.update(f"{axis} {coordinate.name!r} {coordinate.values.size}".encode())
         digest.update(coordinate.values.astype("<f8").tobytes())
+        digest.update(_plain(coordinate.attributes))
     return {
         "name": str(series.name),
         "units": str(series.units),
         "shape": list(series.shape),
         "dtype": (series.source_dtype or series.dtype).newbyteorder("=").name,
         "coordinates": digest.hexdigest(),
+        "attributes": hashlib.sha256(_plain(series.attributes)).hexdigest(),
     }
+
+
+def _plain(attributes: Mapping[str, Any]) -> bytes:
+    """The bytes of some attributes, in any order."""
+    kept = json_attributes(attributes, without=frozenset())
+    return strict_json.dumps(dict(sorted(kept.items())), "the attributes")
 
 
 def _is_box(value: Any, domain: list[int]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -22,16 +23,26 @@ from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import OVERHEAD_BYTES, plan
 from fhash_codec.compact.tiles import Blocks
 from fhash_codec.config import EncodeConfig
+from fhash_codec.features.scan import Extremes
 from fhash_codec.features.selection import Source, open_source, select_features
 from fhash_codec.header import check_name
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.belonging import (
+    Labels,
+    counted_times,
+    is_index,
+    require_alike,
+    require_same_grid,
+)
+from fhash_formats.readers.labelled import array_series
 from fhash_formats.series import (
     AXES,
     AXIS_NAMES,
+    UNNAMED,
     ArraySeries,
     Coordinate,
     Series,
@@ -40,7 +51,12 @@ from fhash_formats.series import (
 )
 from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.support.values import exact_number, json_attributes
+from fhash_formats.support.values import (
+    as_array,
+    exact_number,
+    is_wide_integer,
+    json_attributes,
+)
 
 
 def bound_of(config: EncodeConfig, value_range: ValueRange | None) -> float:
@@ -164,7 +180,7 @@ class Writer:
         value_range: tuple[float, float] | None = None,
         config: EncodeConfig | None = None,
         coords: Mapping[str, Coordinate | npt.ArrayLike] | None = None,
-        name: str = "values",
+        name: str = UNNAMED,
         units: str = "",
         attributes: Mapping[str, Any] | None = None,
         time_units: str = "",
@@ -194,7 +210,7 @@ class Writer:
         settings = _settings(config, max_error, max_error_rel)
         known = None if value_range is None else ValueRange(*map(_number, value_range))
         bound = bound_of(settings, known)
-        variable = {
+        variable: dict[str, Any] = {
             "name": str(name),
             "units": str(units),
             "attributes": json_attributes(dict(attributes or {}), without=frozenset()),
@@ -215,6 +231,8 @@ class Writer:
             )
 
         self._new_file = new_file
+        told = {"variable": {**variable, "dtype": ""}, "domain": {"shape": (1, *frame)}}
+        self._labels = Labels.of_file(path, told, positions)
         tile = parse_tile(settings.tile, (MAX_STEPS, *frame))
         self._tile_steps = None if tile is None or tile[0] == MAX_STEPS else tile[0]
         self._begin(path, frame)
@@ -235,6 +253,8 @@ class Writer:
         z, y, x = growing.shape
         self._begin(Path(path), (z, y, x))
         self._stack, self._file = stack, growing
+        with open_volume(path) as volume:
+            self._labels = _labels_of(volume)
         self._dtype = growing.coder.dtype
         self._last = growing.times[-1]
         return self
@@ -263,16 +283,18 @@ class Writer:
     def append(self, frame: npt.ArrayLike, time: float | None = None) -> None:
         """Append the next step; the layer that it fills is written before this returns.
 
-        frame: finite values (z, y, x), each time of the same number type. It is copied.
-        time: of the step, later than that of the step before; by default one more than that, from 0
-            on.
+        frame: finite values (z, y, x), each time of the same number type. It is copied. The labels
+            of an array of xarray must be those of the file.
+        time: of the step, later than that of the step before; by default that of a labelled frame,
+            else one more than the one before, from 0 on.
 
         Raises InputError for a frame or a time that does not fit, which is then left out, and
         OutputError if the file cannot be written; it then keeps the layers before.
         """
         if self._is_closed:
             raise InputError(f"{self.path}: the writer is closed; Writer.resume goes on with it")
-        values = self._checked(np.asarray(frame))
+        values, time = self._unlabelled(frame, time)
+        values = self._checked(values)
         when = self._checked_time(time)
         self._dtype, self._last = values.dtype, when
         self._frames.append(values)
@@ -305,6 +327,21 @@ class Writer:
         """Close the file, also where the block failed: what was appended is kept."""
         self.close()
 
+    def _unlabelled(self, frame: Any, time: Any) -> tuple[npt.NDArray[Any], Any]:
+        """The values of a frame and its time; raises InputError for one of another series."""
+        what = f"step {self.steps}"
+        if len(getattr(frame, "dims", None) or ()) < len(self.shape):
+            return as_array(frame, what), time
+        series = array_series(frame)
+        if series.shape[0] != 1:
+            raise InputError(f"{what}: the frame has {series.shape[0]} steps; append one at a time")
+        labels = replace(Labels.of(series), source=f"{what}: the frame", dtypes=())
+        require_alike(labels, replace(self._labels, dtypes=()))
+        if time is None and "t" in series.given:
+            file, own = self._labels.coords["t"], series.coords["t"]
+            time = _counted_as_in(self.path, file, f"{what}: the frame", own)[0]
+        return series.read(0), time
+
     def _checked(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """A copy of a frame; raises InputError for one that does not fit."""
         step = self.steps
@@ -322,8 +359,8 @@ class Writer:
         if dtype.kind == "f" and not np.isfinite(values).all():
             count = int(np.count_nonzero(~np.isfinite(values)))
             raise InputError(
-                f"step {step}: {count} of its values are NaN or infinite; a file that grows has "
-                "none: put a number in their place"
+                f"step {step}: {count} of its values are missing or infinite; a file that grows "
+                "has none: put a number in their place"
             )
         return np.array(values, dtype=dtype, order="C")
 
@@ -409,7 +446,8 @@ def _positions(
         known = isinstance(given, Coordinate)
         name = str(given.name) if isinstance(given, Coordinate) else AXIS_NAMES[axis]
         attributes = dict(given.attributes) if isinstance(given, Coordinate) else {}
-        values = np.array(given.values if isinstance(given, Coordinate) else given, dtype=float)
+        stored = given.values if isinstance(given, Coordinate) else given
+        values = as_array(stored, f"the coordinate of {axis}").astype(float)
         if axis != "t" and values.shape != result[axis].values.shape:
             raise InputError(
                 f"the coordinate of {axis} has shape {values.shape}; "
@@ -481,65 +519,105 @@ def _add(
 ) -> None:
     """Code all steps of a series, layer by layer."""
     layer, steps = growing.coder.tile[0], series.shape[0]
+    extremes = Extremes(series.dtype, series.unlikely)
     with thread_pool() as workers:
         for first in range(0, steps, layer):
             span = range(first, min(first + layer, steps))
-            frames = [_frame(series, step) for step in span]
+            frames = [_frame(series, step, growing.coder.dtype) for step in span]
+            for frame in frames:
+                extremes.add(frame, frame.size, frame.min().item(), frame.max().item())
             coded = growing.coder.code(frames, growing.figures, workers)
             growing.add(coded, times[span.start : span.stop].tolist(), publish=False)
             progress("appending", span.stop, steps, "")
+    extremes.refuse(series)
 
 
-def _frame(series: Series, step: int) -> npt.NDArray[Any]:
-    """A frame; raises InputError for one with missing values."""
+def _frame(series: Series, step: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """A frame in the type of the file; raises InputError for one with missing values."""
     frame = series.read(step)
     if frame.dtype.kind == "f" and not np.isfinite(frame).all():
         raise InputError(
             f"{series.source}: step {step} has values that are missing or infinite; a file that "
             "grows has none: encode these data as a file of their own"
         )
-    return frame
+    if frame.dtype.kind == "f" and is_wide_integer(dtype) and np.abs(frame).max() > 1 << 53:
+        raise InputError(
+            f"{series.source}: step {step} has integers beyond 2^53, which a declared fill value "
+            "makes floats of: they are rounded; --raw-values reads them as they are stored"
+        )
+    return frame.astype(dtype, copy=False)
+
+
+def _labels_of(volume: Volume) -> Labels:
+    return Labels.of_file(volume.path, volume.container.header, volume.coords)
 
 
 def _require_same(series: Series, volume: Volume) -> None:
     """Raise InputError unless a series is more of what a volume is."""
-    what, path = series.source, volume.path
-    for name, here, there in (
-        ("shape (z, y, x)", series.shape[1:], volume.shape[1:]),
-        ("number type", str(series.source_dtype or series.dtype), volume.info["variable"]["dtype"]),
-    ):
-        if here != there:
-            raise InputError(f"{what} has {name} {here}, {path} has {there}; they must be the same")
-    if series.units and volume.units and series.units != volume.units:
-        raise InputError(f"{what} is in {series.units}, {path} in {volume.units}; convert one")
-    for axis in AXES[1:]:
-        these, those = series.coords[axis].values, volume.coords[axis].values
-        if not np.array_equal(these, those) and not _is_index(these):
-            raise InputError(
-                f"{what} has positions {these[0]:.9g} to {these[-1]:.9g} along {axis}, {path} has "
-                f"{those[0]:.9g} to {those[-1]:.9g}; they must be the same"
-            )
-    units = series.coords["t"].attributes.get("units")
-    other = volume.coords["t"].attributes.get("units")
-    if units is not None and other is not None and units != other:
-        raise InputError(f"times of {what} are in '{units}', those of {path} in '{other}'")
+    labels = Labels.of(series)
+    require_alike(replace(labels, dtypes=labels.dtypes[1:]), _labels_of(volume))
+    require_same_grid(series.metadata, volume.metadata, (series.source, str(volume.path)))
 
 
 def _times(series: Series, growing: GrowingFile) -> npt.NDArray[np.float64]:
-    """The times of the steps to append; raises InputError unless they follow those of the file."""
-    times, before = series.coords["t"].values, growing.times
-    if _is_index(times) and _is_index(np.array(before)):
-        return times + len(before)
-    if before and not times[0] > before[-1]:
-        raise InputError(
-            f"{series.source} begins at time {times[0]:.9g}, and the file ends at "
-            f"{before[-1]:.9g}; keep fewer steps of the file, or select later ones of the data"
-        )
+    """The times of the steps to append, counted as in the file.
+
+    Steps without times go on at the distance of those before. Raises InputError unless all times
+    ascend, and warns (FhashWarning) of times that were made up.
+    """
+    before, what = growing.time, series.source
+    if "t" not in series.given:
+        return _times_after(what, before, series.shape[0])
+    times = _counted_as_in(growing.path, before, what, series.coords["t"])
     if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-        raise InputError(f"{series.source}: its times must be finite and ascend")
+        raise InputError(f"{what}: its times must be finite and ascend")
+    if not (np.diff(before.values) > 0).all():
+        raise InputError(f"{growing.path}: its times do not ascend; begin another file")
+    if not times[0] > before.values[-1]:
+        raise InputError(
+            f"{what} begins at time {times[0]:.9g}, and the file ends at "
+            f"{before.values[-1]:.9g}; keep fewer steps of the file, or select later ones of the "
+            "data"
+        )
     return times
 
 
-def _is_index(positions: npt.NDArray[np.float64]) -> bool:
-    """Whether positions are those of an axis without any: counted from 0."""
-    return np.array_equal(positions, np.arange(positions.size))
+def _counted_as_in(
+    path: Path, before: Coordinate, what: str, own: Coordinate
+) -> npt.NDArray[np.float64]:
+    """Times counted as those of a file; raises InputError where they cannot be compared."""
+    here, there = own.attributes.get("units"), before.attributes.get("units")
+    if here and not there and is_index(before):
+        raise InputError(
+            f"{what} has times in '{here}', and {path} has none but the numbers of its steps; "
+            "give it times in such units (time_units), or give the data without times"
+        )
+    if not (here and there):
+        return own.values
+    return counted_times(what, ((path, before), (Path(what), own)))[1]
+
+
+def _times_after(what: str, before: Coordinate, count: int) -> npt.NDArray[np.float64]:
+    """Times of some steps that have none, behind those of a file whose times are even."""
+    steps = np.diff(before.values)
+    even = steps.size and steps[0] > 0 and np.allclose(steps, steps[0], rtol=EVEN, atol=0)
+    told = before.attributes.get("units")
+    if not even and not is_index(before):
+        raise InputError(
+            f"{what} has no times, and those of the file, which ends at {before.values[-1]:.9g}, "
+            "have no even distance; give the data with times"
+        )
+    step = float(steps[0]) if steps.size else 1.0
+    times: npt.NDArray[np.float64] = before.values[-1] + step * np.arange(1, count + 1)
+    if told or not is_index(before):
+        warnings.warn(
+            f"{what} has no times: its steps go on from {times[0]:.9g} to {times[-1]:.9g}, as far "
+            f"apart as those before{f', in {told!r}' if told else ''}",
+            FhashWarning,
+            stacklevel=3,
+        )
+    return times
+
+
+EVEN = 1e-6
+"""Share by which distances of times that are even may differ, as float64 rounds them."""

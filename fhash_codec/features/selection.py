@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
@@ -31,7 +30,7 @@ from fhash_formats.readers.cf import settled
 from fhash_formats.readers.labelled import array_series
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import Series
-from fhash_formats.support.values import is_wide_integer
+from fhash_formats.support.values import as_array, is_wide_integer
 
 Source = str | Path | Series | npt.ArrayLike
 """Data to encode: a file, a Series, an array (t, z, y, x) or (z, y, x), labelled or not, or a
@@ -65,7 +64,7 @@ def mask_files(config: EncodeConfig) -> list[str]:
 
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
     """The feature of a mask in memory; raises InputError for a shape other than the series'."""
-    values = np.asarray(mask, dtype=bool)
+    values = as_array(mask, "mask").astype(bool)
     if values.shape not in (series.shape, series.shape[1:]):
         raise InputError(
             f"mask has shape {values.shape}; the series has {series.shape} in (t, z, y, x)"

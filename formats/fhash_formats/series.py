@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, RegionError
-from fhash_formats.support.values import plain_text
+from fhash_formats.support.values import as_array, plain_text
 
 NO_AXIS = ""
 """Axis of a dimension of length 1 that is none of t, z, y and x."""
@@ -403,6 +403,9 @@ class Series(ABC):
         defaults: default fill values of the format that were met in the frames read so far, of an
             array that declares no other. Among floats they are missing.
         valid: least and greatest valid value that the source declares. Values outside are data.
+        named: whether the source names the variable; else its name is made of that of the file.
+        group: that the variable is in, "" for none, and where the user names the variable.
+        given: axes whose coordinate the source gives.
     """
 
     source: str
@@ -424,6 +427,9 @@ class Series(ABC):
     lazy: Any = None
     defaults: AbstractSet[float] = frozenset()
     valid: tuple[Any, Any] | None = None
+    named: bool = True
+    group: str = ""
+    given: AbstractSet[str] = frozenset()
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
     @property
@@ -498,6 +504,7 @@ class Series(ABC):
         self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
         self.not_stored, self.defaults = series.not_stored, series.defaults
         self.valid = series.valid
+        self.named, self.group, self.given = series.named, series.group, series.given
 
     def outside(self, frames: npt.NDArray[Any]) -> int:
         """Number of values in frames that are outside the range which the source calls valid."""
@@ -632,6 +639,10 @@ class StepsSeries(Series):
         self.series.close()
 
 
+UNNAMED = "values"
+"""Name of a variable that has none."""
+
+
 class ArraySeries(Series):
     """An array in memory, (t, z, y, x) or (z, y, x), as a series; masked floats become NaN.
 
@@ -643,20 +654,21 @@ class ArraySeries(Series):
 
     def __init__(
         self,
-        array: npt.ArrayLike,
+        array: Any,
         *,
-        name: str = "values",
+        name: str = UNNAMED,
         units: str = "",
         coords: Mapping[str, Coordinate] | None = None,
         missing: Sequence[float] = (),
         keep_extremes: bool = False,
     ) -> None:
-        values = _unmasked(array)
+        values = as_array(array)
         if missing and values.dtype.kind in "iuf":
             self.source_dtype = values.dtype if values.dtype.kind in "iu" else None
             self.fill = missing[0]
             values = _without(values, missing)
         self.keep_extremes = keep_extremes
+        self.named, self.given = name != UNNAMED, frozenset(coords or ())
         self.source, self.name, self.units, self.attributes = "array", name, units, {}
         if values.ndim == 3:
             values = values[None]
@@ -718,23 +730,6 @@ def check_coords(
                 f"{what}: the coordinate of {axis} is {values.dtype} {values.shape}; "
                 f"float64 ({length},) is needed"
             )
-
-
-def _unmasked(array: npt.ArrayLike) -> npt.NDArray[Any]:
-    """The values, with NaN for masked ones; the numbers under a mask have no meaning.
-
-    Raises InputError for masked values of a type that has no NaN.
-    """
-    if not np.ma.is_masked(array):
-        return np.asarray(array)
-    masked: np.ma.MaskedArray[Any, Any] = np.ma.asarray(array)
-    if masked.dtype.kind != "f":
-        raise InputError(
-            f"array: masked values of type {masked.dtype}, which has no NaN; "
-            "convert it to float32 or float64 first"
-        )
-    filled: npt.NDArray[Any] = masked.filled(np.nan)
-    return filled
 
 
 def _without(values: npt.NDArray[Any], missing: Sequence[float]) -> npt.NDArray[Any]:

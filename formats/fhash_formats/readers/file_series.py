@@ -386,7 +386,6 @@ class FileSeries(Series):
     Raises InputError for a shape or type that cannot be a series.
 
     Attributes:
-        given: axes whose coordinate the file gives.
         stamps: stamps of everything that is read, from when it was opened.
     """
 

@@ -18,7 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.cf import NUMBERED, counted_times, join_times
+from fhash_formats.readers.belonging import (
+    Labels,
+    counted_times,
+    join_times,
+    require_alike,
+    require_same_grid,
+)
+from fhash_formats.readers.cf import NUMBERED
 from fhash_formats.readers.file_series import FileSeries, FolderStamp, Stamp
 from fhash_formats.readers.surroundings import warn_left_out
 from fhash_formats.series import (
@@ -48,7 +55,9 @@ class _Joined:
         self._pieces = {each.name: [each] for each in first.variables}
 
     def add(self, part: SourceMetadata) -> None:
-        """Add the next file."""
+        """Add the next file; raises InputError where it lies elsewhere on the map."""
+        files = (str(part.file), str(self._first.file))
+        require_same_grid(part, self._first, files)
         if part.dimensions != self._first.dimensions:
             self.left_out["dimensions"] = DIFFERS
         for name in _differing(self._attributes, part.attributes):
@@ -252,10 +261,14 @@ class JoinedSeries(Series):
         shares: dict[Path, npt.NDArray[np.float64]] = {}
         never: NotStored | None = None
         first: Series | None = None
+        known: Labels | None = None
+        fills: set[int | float | None] = set()
         for path in paths:
             with open_part(path) as part:
                 first = first or part
-                _check_alike(part, path, first, paths[0])
+                labels = replace(Labels.of(part), source=str(path))
+                known = known or labels
+                require_alike(labels, known)
                 time = part.coords["t"] if "t" in part.given else None
                 self._parts.append(
                     _Part(path=path, stamps=part.stamps, steps=range(part.shape[0]), time=time)
@@ -265,6 +278,7 @@ class JoinedSeries(Series):
                 shares[path] = np.zeros(part.shape[0]) if told is None else told.shares
                 names.append(part.name)
                 limits.append(part.valid)
+                fills.add(part.fill)
                 self.remark = self.remark or part.remark
                 counted = counted and not part.remark.endswith(NUMBERED)
                 files += part.files
@@ -276,6 +290,10 @@ class JoinedSeries(Series):
         ends = [each for each in limits if each is not None]
         whole = len(ends) == len(limits)
         self.valid = (min(e[0] for e in ends), max(e[1] for e in ends)) if whole else None
+        # what stands for missing values in one file may be a value in another
+        self.fill = first.fill if len(fills) == 1 else None
+        timed = times or (counted and self._parts[0].time is not None)
+        self.given = (first.given - {"t"}) | ({"t"} if timed else set())
         if overlap is not None:
             if not counted:
                 raise InputError(f"{pattern}: --overlap is for files with times; some count steps")
@@ -394,21 +412,3 @@ def _common_name(names: Sequence[str]) -> str:
     pairs = takewhile(lambda pair: pair[0] == pair[1], zip(low, high, strict=False))
     common = "".join(letter for letter, _ in pairs).rstrip("0123456789_-. ")
     return low if low == high else common or names[0]
-
-
-def _check_alike(part: Series, path: Path, first: Series, first_path: Path) -> None:
-    for what, here, there in (
-        ("a frame (z, y, x) of shape", part.shape[1:], first.shape[1:]),
-        ("values of type", part.dtype, first.dtype),
-        ("the unit", part.units, first.units),
-    ):
-        if here != there:
-            raise InputError(
-                f"{path} has {what} {here}, {first_path} {there}; files of one series must be alike"
-            )
-    for axis in ("z", "y", "x"):
-        if not np.array_equal(part.coords[axis].values, first.coords[axis].values):
-            raise InputError(
-                f"{path} has other coordinates along {axis} than {first_path}; files of one series"
-                " must be alike"
-            )

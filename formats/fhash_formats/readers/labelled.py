@@ -48,7 +48,7 @@ from fhash_formats.series import (
 )
 from fhash_formats.support.dates import clock
 from fhash_formats.support.files import file_name, is_url, object_store, without_secrets
-from fhash_formats.support.values import PACKING
+from fhash_formats.support.values import PACKING, as_array, is_lazy
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -58,12 +58,6 @@ OF_FILE = (COORDINATES, *NAMING, *sorted(PACKING - {"dtype"}))
 FILL = "_FillValue"
 SINCE_1970 = "seconds since 1970-01-01"
 """Units of dates that no file has counted."""
-
-
-def is_lazy(array: Any) -> bool:
-    """Whether an array is one of dask, whose values are computed when they are asked for."""
-    graph = getattr(array, "__dask_graph__", None)
-    return graph is not None and graph() is not None
 
 
 def array_series(source: Any) -> Series:
@@ -90,7 +84,7 @@ def _dask_series(array: Any) -> FileSeries:
         name=labels.name,
         shape=array.shape,
         dtype=array.dtype,
-        read=lambda places: np.asarray(array[places]),
+        read=lambda places: as_array(array[places]),
         chunks=array.chunks,
     )
     source = Source(name=labels.source, variables=[whole])
@@ -214,7 +208,7 @@ def _source(array: Any, beside: Any, name: str) -> Source:
         values=own.dtype.newbyteorder("="),
         dimensions=tuple(map(str, array.dims)),
         attributes=_attributes(own),
-        read=lambda places: np.asarray(own[places].values),
+        read=lambda places: as_array(own[places], f"array '{name}'"),
         chunks=own.chunks or own.encoding.get("chunksizes"),
         behind=lambda: _behind(own),
         handle=own.encoding,
@@ -261,7 +255,7 @@ def _stored(name: str, array: Any, *, auxiliary: bool) -> Variable:
         dimensions=tuple(map(str, made.dims)),
         attributes=_attributes(made) if numbers else dict(made.attrs),
         read=(
-            (lambda places: np.asarray(_encoded(name, made[places]).values))
+            (lambda places: as_array(_encoded(name, made[places])))
             if numbers
             else (lambda places: made[places].to_numpy())
         ),

@@ -80,12 +80,26 @@ from fhash_formats.series import (
     AXES,
     AXIS_NAMES,
     COORDINATES,
+    UNNAMED,
     Coordinate,
     SourceMetadata,
     references,
     shown_name,
 )
 from fhash_formats.support.values import STORED, json_attributes
+
+SELF_NAMING = (".vti", ".vtr", ".pvti", ".pvtr", ".vtk", ".vtkhdf", ".h5", ".hdf5", ".hdf", ".he5")
+"""Suffixes of formats that name their variables."""
+
+
+def is_named(opened: Source, variable: Variable) -> bool:
+    """Whether a source names a variable; else its name was made of that of the file."""
+    path, one = opened.path, len(opened.variables) == 1
+    if path is None:
+        return variable.name != UNNAMED
+    if path.suffix.lower() in SELF_NAMING or (opened.naming and not (path.is_dir() and one)):
+        return True
+    return not (variable.name and path.stem.startswith(variable.name))
 
 
 class Selection:
@@ -563,6 +577,9 @@ class Selection:
                 FhashWarning,
                 stacklevel=2,
             )
+        series.named = is_named(opened, variable)
+        # who names the variable means it in whatever group it is
+        series.group = "" if self.request.var else variable.group
         if not variable.members and not variable.field:
             unfit = without if request.raw_values else frozenset[str]()
             series.metadata = partial(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import DamagedFileError
+from fhash_formats.errors import DamagedFileError, InputError
 
 Values = npt.NDArray[Any]
 """Numbers of any type."""
@@ -28,6 +28,62 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def as_array(array: Any, what: str = "array") -> npt.NDArray[Any]:
+    """The values of anything like an array, with NaN for masked ones: what a mask hides is no data.
+
+    Arrays of dask are computed; lists may hold arrays. what: name of the array, for messages.
+
+    Raises InputError for masked values of a type that has no NaN, and for what numpy cannot read.
+    """
+    if getattr(array, "dims", None) is not None and hasattr(array, "data"):
+        array = array.data  # of xarray, which gives values without their mask
+    if is_lazy(array):
+        array = array.compute()
+    if isinstance(array, list | tuple) and any(map(_is_array, array)):
+        return _stacked([as_array(each, what) for each in array], what)
+    try:
+        if hasattr(array, "__dlpack__") and not hasattr(array, "__array__"):
+            array = np.from_dlpack(array)
+        mask = [each is np.ma.masked for each in array] if isinstance(array, list | tuple) else []
+        if any(mask):
+            shown = [0 if gone else each for gone, each in zip(mask, array, strict=True)]
+            array = np.ma.array(shown, mask=mask)
+        values = np.asanyarray(array)
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        told = " ".join(str(error).split())[:200]
+        raise InputError(f"{what}: it cannot become an array of numpy: {told}") from error
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        if values.dtype.kind != "f":
+            raise InputError(
+                f"{what}: masked values of type {values.dtype}, which has no NaN; "
+                "convert it to float32 or float64 first"
+            )
+        values = values.filled(np.nan)
+    return np.asarray(values)
+
+
+def is_lazy(array: Any) -> bool:
+    """Whether an array is one of dask, whose values are computed when they are asked for."""
+    graph = getattr(array, "__dask_graph__", None)
+    return graph is not None and graph() is not None
+
+
+def _is_array(element: Any) -> bool:
+    """Whether an element of a list is a list or an array itself."""
+    return isinstance(element, list | tuple) or (
+        getattr(element, "shape", ()) != () and not isinstance(element, str)
+    )
+
+
+def _stacked(arrays: Sequence[npt.NDArray[Any]], what: str) -> npt.NDArray[Any]:
+    """The arrays of a list as one; raises InputError where they do not fit."""
+    shapes = {array.shape for array in arrays}
+    if len(shapes) > 1:
+        told = " and ".join(map(str, sorted(shapes)[:2]))
+        raise InputError(f"{what}: a list of arrays of shapes {told}; they must be the same")
+    return np.stack(arrays)
 
 
 DTYPE_NAMES = """int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 float32 float64"""

@@ -18,6 +18,7 @@ from numcodecs.abc import Codec
 from numcodecs.compat import ensure_bytes, ndarray_copy
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.values import as_array
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.tile import (
     DEFAULT_EFFORT,
@@ -96,7 +97,7 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
         """The bytes of an array. Raises InputError for bytes, which have no number type."""
         if isinstance(buf, bytes | bytearray):
             raise InputError("fhash.transform codes numbers: give an array, not bytes")
-        values = np.asarray(buf)
+        values = as_array(buf)
         dtype = supported(values.dtype)
         fortran = values.flags.f_contiguous and not values.flags.c_contiguous
         axes = values.ndim + (_FORTRAN if fortran else 0)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.threads import usable_threads
-from fhash_formats.support.values import Integers, Mask, Values
+from fhash_formats.support.values import Integers, Mask, Values, as_array
 from fhash_formats.transform.predict import Predictor
 from fhash_formats.transform.spec import KINDS, AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import Shape, TileSettings
@@ -575,7 +575,7 @@ def encode_chunk(
     """
     check_effort(effort)
     quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
-    values = np.asarray(values)
+    values = as_array(values)
     tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(
         tile_shape(values.shape)
     )

@@ -26,6 +26,7 @@ import numpy as np
 from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.values import as_array
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.stream import KEY, ArrayAxes, settings_of, take_axes
 from fhash_formats.transform.tile import (
@@ -196,7 +197,7 @@ class TransformCodec(ArrayBytesCodec):
                 "give max_error, max_error_rel or step to write"
             )
         # Filters of numcodecs give one axis, and decoding knows the shape alone.
-        values = np.asarray(chunk_array.as_ndarray_like()).reshape(chunk_spec.shape)
+        values = as_array(chunk_array.as_ndarray_like()).reshape(chunk_spec.shape)
         if self.axes is not None:
             values = ArrayAxes.of(self.axes).to_tile(values)
         if self.settings is None:

@@ -9,10 +9,13 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
+import dask.array
 import numpy as np
 import pytest
+import xarray as xr
 from kill_writer import BOUND as BOUND_WRITER
 from kill_writer import SHAPE as SHAPE_WRITER
 from kill_writer import TILE, frame
@@ -31,7 +34,7 @@ from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.array import transform_codecs
-from fhash_formats.errors import OutputError
+from fhash_formats.errors import FhashWarning, OutputError
 from fhash_formats.series import ArraySeries, Coordinate, index_coordinate
 
 CONFIG = EncodeConfig(max_error=BOUND_WRITER, effort=1, tile=TILE, timings=False)
@@ -87,6 +90,174 @@ def test_times_follow_those_of_the_file(tmp_path) -> None:
         np.testing.assert_array_equal(volume.coords["t"].values, [1, 2, 4.5, 5, 6, 7])
 
 
+def dated(first: int, end: int, start: int = 0, **options) -> xr.DataArray:
+    """Frames a day apart as xarray has them, labelled as a wind. start: day of the first step."""
+    days = np.datetime64("2000-01-01", "ns") + np.timedelta64(1, "D") * (
+        np.arange(first, end) + start
+    )
+    attributes = {"units": "m s-1", "standard_name": "eastward_wind", **options.pop("attrs", {})}
+    coords = {"time": days, "x": np.arange(12.0) / 4, **options.pop("coords", {})}
+    dims = ("time", "z", "y", "x")
+    return xr.DataArray(
+        frames(first, end), coords, dims, name=options.pop("name", "u"), attrs=attributes
+    )
+
+
+def of_calendar(array: xr.DataArray, units: str, calendar: str = "standard") -> xr.DataArray:
+    array.time.encoding.update(units=units, calendar=calendar)
+    return array
+
+
+@pytest.fixture
+def wind(tmp_path) -> Path:
+    path = tmp_path / "wind.fhz"
+    fhash_codec.encode(of_calendar(dated(0, 3), "days since 2000-01-01"), path, CONFIG)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (dated(3, 6, name="v"), "has the variable 'v'"),
+        (dated(3, 6, attrs={"standard_name": "northward_wind"}), "the standard_name 'northward_"),
+        (dated(3, 6, attrs={"units": "km h-1"}), "has the unit km h-1"),
+        (dated(3, 6, coords={"x": np.arange(12.0)}), "has positions along x: 0 to 11"),
+        (dated(3, 6).astype("f8"), "has values of type float64"),
+        (dated(3, 6, start=-1), "begins at time 2, and the file ends at 2"),
+        (dated(3, 6).isel(x=slice(None, None, -1)), "has positions along x: 2.75 to 0"),
+        (dated(3, 6).isel(time=slice(None, None, -1)), "times must be finite and ascend"),
+        (dated(3, 6).convert_calendar("noleap"), "has not the units of the time in"),
+    ],
+)
+def test_another_series_is_not_appended(wind, more: xr.DataArray, message: str) -> None:
+    before = wind.read_bytes()
+    with pytest.raises(InputError, match=message):
+        append(more, wind)
+    assert wind.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("units", "calendar"),
+    [("hours since 2000-01-04", "standard"), ("days since 1999-12-31", "proleptic_gregorian")],
+)
+def test_dates_are_counted_as_in_the_file(wind, units: str, calendar: str) -> None:
+    more = of_calendar(dated(3, 6, attrs={"units": "m/s"}), units, calendar)
+    append(more, wind)
+    with fhash_codec.open(wind) as volume:
+        assert volume.coords["t"].values.tolist() == [0, 1, 2, 3, 4, 5]
+        assert volume.coords["t"].attributes["units"] == "days since 2000-01-01"
+        assert np.abs(volume[:] - frames(0, 6)).max() <= BOUND_WRITER
+
+
+def test_steps_without_times_go_on_evenly_and_it_is_said(wind) -> None:
+    with pytest.warns(FhashWarning, match="no times: its steps go on from 3 to 5, .*days since"):
+        append(frames(3, 6), wind)
+    with fhash_codec.open(wind) as volume:
+        assert volume.coords["t"].values.tolist() == [0, 1, 2, 3, 4, 5]
+        assert volume.units == "m s-1"
+
+
+def test_times_that_have_no_distance_are_not_guessed(tmp_path) -> None:
+    fhash_codec.encode(series(0, 3, [1.0, 2.0, 4.5]), tmp_path / "a.fhz", CONFIG)
+    with pytest.raises(InputError, match="has no times, and those of the file"):
+        append(series(3, 6), tmp_path / "a.fhz")
+    fhash_codec.encode(series(0, 3, [3.0, 2.0, 1.0]), tmp_path / "b.fhz", CONFIG)
+    with pytest.raises(InputError, match="its times do not ascend"):
+        append(series(3, 6, [4.0, 5.0, 6.0]), tmp_path / "b.fhz")
+
+
+def test_counts_with_a_fill_value_go_on_as_counts(tmp_path) -> None:
+    """They are read as floats, and no value is missing."""
+    counts, path = np.rint(frames(0, 6) * 1000).astype("i2"), tmp_path / "a.fhz"
+    fhash_codec.encode(counts[:3], path, replace(CONFIG, max_error=0))
+    append(ArraySeries(counts[3:], missing=[-9999]), path)
+    with fhash_codec.open(path) as volume:
+        np.testing.assert_array_equal(volume[:], counts)
+        assert volume.dtype == np.int16
+    wide = np.full((3, 1, 2, 3), 2**60 + 1)
+    fhash_codec.encode(wide, tmp_path / "b.fhz", EncodeConfig(max_error=0, tile="3x1x2x3"))
+    with pytest.raises(InputError, match=r"integers beyond 2\^53"):
+        append(ArraySeries(wide, missing=[-1]), tmp_path / "b.fhz")
+
+
+def test_fill_values_that_nobody_declared_are_refused_as_by_encode(run) -> None:
+    values = frames(6, 12)
+    values[:, 0, :2] = -9999
+    for refused in (append, lambda source, _: fhash_codec.encode(source, "a.fhz", CONFIG)):
+        with pytest.raises(InputError, match=r"has -9999 at .* of its vertices"):
+            refused(values, run)
+    append(ArraySeries(values, keep_extremes=True), run)
+
+
+HIDDEN = np.ma.masked_greater(frame(0), 0.5)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        HIDDEN,
+        list(HIDDEN),
+        dask.array.from_array(HIDDEN),
+        dask.array.from_array(frame(0)).map_blocks(np.ma.masked_greater, 0.5),
+        xr.DataArray(HIDDEN, dims=("z", "y", "x")),
+    ],
+)
+def test_what_a_mask_hides_is_never_written(run, given) -> None:
+    hidden = int(HIDDEN.mask.sum())
+    with (
+        Writer(run.with_name("w.fhz"), shape=SHAPE_WRITER, config=CONFIG) as writer,
+        pytest.raises(InputError, match=f"step 0: {hidden} of its values are missing"),
+    ):
+        writer.append(given)
+    if not isinstance(given, xr.DataArray):
+        given = [given] if isinstance(given, list) else given[None]
+    with pytest.raises(InputError, match="step 0 has values that are missing"):
+        append(given, run)
+    fhash_codec.encode(given, run, CONFIG, force=True)
+    with fhash_codec.open(run) as volume:
+        assert np.isnan(volume[:]).sum() == hidden
+    assert fhash_codec.diff(given, run)["max_abs_error"] <= BOUND_WRITER
+
+
+def test_hidden_integers_are_refused(tmp_path) -> None:
+    counts = np.ma.masked_greater(np.rint(frame(0) * 1000).astype("i2"), 500)
+    with Writer(tmp_path / "w.fhz", shape=SHAPE_WRITER, config=CONFIG) as writer:
+        for given in (counts, list(counts)):
+            with pytest.raises(InputError, match="step 0: masked values of type int16"):
+                writer.append(given)
+        writer.append(np.ma.array(counts.data))
+        writer.append(counts.data.astype(">i2")[:, ::-1])
+
+
+def test_labelled_frames_belong_to_the_file_and_bring_their_times(tmp_path) -> None:
+    path = tmp_path / "w.fhz"
+    options = {"name": "u", "units": "m/s", "time_units": "hours since 2000-01-01"}
+    options["coords"] = {"x": np.arange(12.0, dtype="f4") / 4}
+    more = dated(0, 6)
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG, **options) as writer:
+        for step in range(3):
+            writer.append(more[step])
+        for wrong, message in (
+            (dated(3, 4, name="v"), "step 3: the frame has the variable 'v'"),
+            (dated(3, 4, attrs={"units": "K"}), "step 3: the frame has the unit K"),
+            (dated(3, 4).assign_coords(x=np.arange(12)), "step 3: the frame has positions along x"),
+            (more, "has 6 steps; append one at a time"),
+        ):
+            with pytest.raises(InputError, match=message):
+                writer.append(wrong)
+    with Writer.resume(path) as writer:
+        with pytest.raises(InputError, match="has the variable 'v'"):
+            writer.append(dated(3, 4, name="v"))
+        writer.append(more[3])
+    with fhash_codec.open(path) as volume:
+        assert volume.coords["t"].values.tolist() == [0, 24, 48, 72]
+    with (
+        Writer(tmp_path / "n.fhz", shape=SHAPE_WRITER, config=CONFIG) as writer,
+        pytest.raises(InputError, match=r"has times in .*since.*give it times in such units"),
+    ):
+        writer.append(more[0].drop_vars("x"))
+
+
 def with_gap(values: np.ndarray) -> np.ndarray:
     values = values.copy()
     values[4, 0, 0, 0] = np.nan
@@ -99,19 +270,20 @@ def test_what_does_not_fit_changes_nothing(run) -> None:
     place = {"x": Coordinate(name="x", values=np.arange(12) + 1.0)}
     hours = {"t": Coordinate(name="t", values=np.arange(3) + 9.0, attributes={"units": "h"})}
     for source, message in (
-        (frames(6, 9)[:, :, :9], r"has shape \(z, y, x\)"),
-        (frames(6, 9).astype("f8"), "has number type float64"),
+        (frames(6, 9)[:, :, :9], r"has a frame \(z, y, x\) of shape \(4, 9, 12\)"),
+        (frames(6, 9).astype("f8"), "has values of type float64"),
         (with_gap(frames(6, 12)), "step 4 has values that are missing"),
-        (ArraySeries(frames(6, 9), coords=place), "has positions 1 to 12 along x"),
+        (ArraySeries(frames(6, 9), coords=place), "has positions along x: 1 to 12, .* 0 to 11"),
         (run, "is encoded already"),
     ):
         with pytest.raises(InputError, match=message):
             append(source, run)
         assert run.read_bytes() == before
         assert os.listdir(run.parent) == ["run.fhz"]
-    # Units that only one of the two has are no contradiction.
+    # Units that only one of the two has are no contradiction, but hours are no numbers of steps.
+    with pytest.raises(InputError, match=r"has times in 'h', and .* has none but the numbers"):
+        append(ArraySeries(frames(6, 9), coords=hours), run)
     append(metres, run, keep=3)
-    append(ArraySeries(frames(6, 9), coords=hours), run)
 
 
 def test_a_failure_while_steps_are_coded_changes_nothing(run) -> None:
@@ -261,7 +433,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
         writer.append(good)
         for wrong, time_of_step, message in (
             (good[:, :-1], None, r"step 1: the frame has shape \(4, 9, 12\)"),
-            (bad, None, "step 1: 2 of its values are NaN or infinite"),
+            (bad, None, "step 1: 2 of its values are missing or infinite"),
             (good.astype("f8"), None, "step 1: the frame is float64, those before are float32"),
             (good.astype(complex), None, "complex128 cannot be encoded"),
             (good, 0.0, "step 1: its time is 0, the one before has 0.0; times must"),

@@ -17,7 +17,8 @@ import zarr
 from stored_series import VALUES, create_zarr, frames, save_netcdf, write_hdf5
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.cf import Column, counts_steps, join_times, packing, real_time
+from fhash_formats.readers.belonging import join_times
+from fhash_formats.readers.cf import Column, counts_steps, packing, real_time
 from fhash_formats.readers.file_series import (
     DTYPES,
     LONGEST_MESSAGE,

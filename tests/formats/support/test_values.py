@@ -37,6 +37,7 @@ from fhash_formats.support.values import (
     PACKING,
     PLUMBING,
     UnknownValueError,
+    as_array,
     attribute_json,
     attribute_value,
     inline_array,
@@ -522,3 +523,69 @@ def test_written_dates_are_counted(texts: list[str], values: list[float], units:
 @pytest.mark.parametrize("texts", [["2018-02-30"], ["JJA", "SON"], ["2018-10-15", ""], []])
 def test_other_texts_are_no_dates(texts: list[str]) -> None:
     assert of_texts(texts, "standard") is None
+
+
+class Exchanged:
+    """An array that is exchanged by DLPack alone."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __dlpack__(self, **options: Any) -> Any:
+        return self.values.__dlpack__(**options)
+
+    def __dlpack_device__(self) -> Any:
+        return self.values.__dlpack_device__()
+
+
+class Elsewhere:
+    """An array in the memory of a GPU, as cupy refuses to copy it."""
+
+    shape = (2, 2)
+
+    def __array__(self, *more: Any, **options: Any) -> np.ndarray:
+        raise TypeError("Implicit conversion to a NumPy array is not allowed. Use .get()")
+
+
+NUMBERS = np.array([[1.0, 2.0], [3.0, 4.0]])
+COVERED = np.ma.array(NUMBERS, mask=[[False, True], [False, False]], fill_value=-1)
+SHOWN = np.array([[1.0, np.nan], [3.0, 4.0]])
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (COVERED, SHOWN),
+        (COVERED.harden_mask(), SHOWN),
+        (COVERED.astype(">f4"), SHOWN),
+        (list(COVERED), SHOWN),
+        ([[COVERED, COVERED], [COVERED, COVERED]], np.broadcast_to(SHOWN, (2, 2, 2, 2))),
+        ([[1.0, np.ma.masked], [3.0, 4.0]], SHOWN),
+        (np.ma.array(NUMBERS), NUMBERS),
+        (np.ma.array(NUMBERS.astype(int)), NUMBERS),
+        (Exchanged(NUMBERS), NUMBERS),
+        (NUMBERS[::-1, ::-1].T, NUMBERS[::-1, ::-1].T),
+        (np.ma.masked, np.array(np.nan)),
+        ([], np.empty(0)),
+        (NUMBERS.tolist(), NUMBERS),
+    ],
+)
+def test_anything_like_an_array(given: Any, expected: np.ndarray) -> None:
+    found = as_array(given)
+    assert type(found) is np.ndarray
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.ma.array([1, 2], mask=[True, False]), "masked values of type int64, which has no NaN"),
+        ([np.ma.array([1, 2], mask=[True, False])], "masked values of type int64"),
+        ([1, np.ma.masked], "masked values of type int64"),
+        (Elsewhere(), r"it cannot become an array of numpy: Implicit .* Use \.get\(\)"),
+        ([np.zeros(2), np.zeros(3)], r"a list of arrays of shapes \(2,\) and \(3,\)"),
+    ],
+)
+def test_what_is_no_array_is_told_in_one_line(given: Any, message: str) -> None:
+    with pytest.raises(InputError, match=f"the field: {message}"):
+        as_array(given, "the field")
