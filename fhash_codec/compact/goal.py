@@ -372,18 +372,32 @@ DECIDED = 0.3
 """dB by which a PSNR must exceed its promise, and the other one may, where that one decided."""
 
 
-def missed_promise(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+def missed_promise(
+    config: EncodeConfig, figures: Mapping[str, Any], rounding: float = 0.0
+) -> str | None:
     """Text on a promise that a file misses; None if it keeps what the settings promise.
 
     figures: of the file, as in `report`; `promised` has what its header says was promised.
+    rounding: difference between values of two readers at most, as a share of the range.
     """
-    promised = figures["promised"]
+    promised, whole = figures["promised"], (figures["psnr"], figures["rmse"])
     return (
         _missed_bound(config, figures)
-        or _missed_psnr(promised.get("psnr"), figures["psnr"], figures["rmse"], "the coreset")
-        or _missed_bulk(promised.get("psnr_bulk"), figures)
+        or _missed_psnr(promised.get("psnr"), *whole, rounding, "the coreset")
+        or _missed_bulk(promised.get("psnr_bulk"), figures, rounding)
         or _missed_ratio(config, figures)
     )
+
+
+def held_psnr(psnr: float | None, rounding: float) -> float:
+    """Return the PSNR in dB that every reader has at least, by that of one (None for no error).
+
+    Root mean squares add up at most.
+
+    rounding: as in `missed_promise`, of the range that the PSNR is relative to.
+    """
+    error = (0.0 if psnr is None else 10 ** (-psnr / 20)) + rounding
+    return -20 * math.log10(error) if error else math.inf
 
 
 def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
@@ -393,8 +407,8 @@ def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
     """
     bulk = figures["quality"]["bulk"]
     psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
-    trained = config.profile == "paper" and config.psnr is None
-    if config.psnr_bulk is None and not trained and None not in (psnr, psnr_bulk):
+    plain = config.profile == "paper" and not config.coded
+    if config.psnr_bulk is None and not plain and None not in (psnr, psnr_bulk):
         enough = min(DEFAULT_PSNR_BULK, psnr - FAR_BELOW)
         if psnr_bulk < enough:
             low, high = bulk["range"]
@@ -464,29 +478,37 @@ def _missed_bound(config: EncodeConfig, figures: Mapping[str, Any]) -> str | Non
 
 
 def _missed_psnr(
-    promised: float | None, psnr: float | None, rmse: float | None, where: str
+    promised: float | None, psnr: float | None, rmse: float | None, rounding: float, where: str
 ) -> str | None:
     """Text on a PSNR below the promised one; None if there is no such promise or it holds."""
-    if promised is None or rmse == 0:
+    if promised is None:
         return None
-    if psnr is None:
+    if psnr is None and rmse != 0:
         return f"an unknown PSNR over {where}, {promised:g} dB were asked for"
-    if psnr < promised:
-        return f"{psnr:.2f} dB over {where}, {promised:g} dB were asked for"
-    return None
+    held = held_psnr(psnr, rounding)
+    if held >= promised:
+        return None
+    if psnr is None or psnr >= promised:
+        return (
+            f"{held:.2f} dB over {where} in every reader, since float32 rounds otherwise in each, "
+            f"{promised:g} dB were asked for"
+        )
+    return f"{psnr:.2f} dB over {where}, {promised:g} dB were asked for"
 
 
-def _missed_bulk(promised: float | None, figures: Mapping[str, Any]) -> str | None:
+def _missed_bulk(promised: float | None, figures: Mapping[str, Any], rounding: float) -> str | None:
     """Text on a PSNR of the bulk below the promised one; None if there is none or it holds."""
     bulk = figures["quality"]["bulk"]
-    if promised is None or figures["rmse"] == 0:
+    if promised is None or (bulk is None and figures["rmse"] == 0):
         return None
     if bulk is None:
         return (
             "the middle 98 % of the values are all the same, and have no PSNR, "
             f"{promised:g} dB were asked for"
         )
-    return _missed_psnr(promised, bulk["psnr"], bulk["rmse"], "the bulk")
+    low, high = bulk["range"]
+    rounding = rounding * figures["data_range"] / (high - low) if rounding else 0.0
+    return _missed_psnr(promised, bulk["psnr"], bulk["rmse"], rounding, "the bulk")
 
 
 def _missed_ratio(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:

@@ -246,7 +246,7 @@ def coreset_of(series: Any, feature: str, dilation: int = 1) -> Any:
     from fhash_codec.paper.encode import select
     from fhash_codec.progress import silent
 
-    config = EncodeConfig(profile="paper", features=(feature,), dilation=dilation)
+    config = EncodeConfig(profile="paper", tables="float16", features=(feature,), dilation=dilation)
     return select(series, config, silent).coreset
 
 

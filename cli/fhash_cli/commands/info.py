@@ -55,7 +55,6 @@ def card_rows(info: Mapping[str, Any], *, verbose: bool) -> list[tuple[str, str]
         *_tables(info["model"], card["tables"], verbose=verbose),
         *_mlp(card["mlp"], verbose=verbose),
         ("occupancy", _occupancy(card["occupancy"])),
-        *([("residual", _stored_as(card["residual"]))] if "residual" in card else []),
     ]
 
 

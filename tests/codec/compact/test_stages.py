@@ -34,6 +34,7 @@ from fhash_codec.compact.goal import (
     exchange,
     geometric_mean,
     goal_of,
+    held_psnr,
     missed_promise,
     promise,
     remarks,
@@ -589,6 +590,20 @@ def figures(**others):
     bulk = None if psnr_bulk is None else {"psnr": psnr_bulk, "rmse": 0.1, "range": [1.0, 2.0]}
     usual = {"psnr": 50.0, "rmse": 0.1, "max_abs_error": 0.5, "ratio": 30.0, "data_range": 10.0}
     return {**usual, "promised": {}, "quality": {"bulk": bulk}, "psnr_bulk": psnr_bulk, **others}
+
+
+def test_a_promise_of_a_network_holds_with_the_rounding_of_other_readers() -> None:
+    settings, promised = EncodeConfig(psnr=50.0, psnr_bulk=42.0), {"psnr": 50.0, "psnr_bulk": 42.0}
+
+    def told(psnr: float, psnr_bulk: float, rounding: float) -> str | None:
+        found = figures(promised=promised, psnr=psnr, psnr_bulk=psnr_bulk)
+        return missed_promise(settings, found, rounding)
+
+    assert told(50.1, 42.4, 3e-5) is None
+    assert "49.99 dB over the coreset in every reader" in (told(50.1, 42.4, 4e-5) or "")
+    # the bulk has a tenth of the range
+    assert "41.98 dB over the bulk in every reader" in (told(60.0, 42.2, 2e-5) or "")
+    assert held_psnr(None, 0.0) == np.inf
 
 
 @pytest.mark.parametrize(
