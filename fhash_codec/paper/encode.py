@@ -165,7 +165,8 @@ def encode_paper(
     bulk = find_bulk(lambda: iter([counted]), WHOLE)
     if config.tables == "auto" or any(getattr(config, name) is not None for name in PAIR):
         about = WHOLE if value_range.low < value_range.high else value_range
-        config = replace(config, **promise(config, about, bulk))
+        promised: dict[str, Any] = promise(config, about, bulk)
+        config = replace(config, **promised)
     aim = _needed_psnr(config, bulk)
     goal = None
     if aim is not None:
