@@ -124,7 +124,7 @@ NEAR = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class EncodedNetwork:
-    """What was written.
+    """A network that is written.
 
     Attributes:
         header: complete, with the measured quality.
