@@ -272,7 +272,7 @@ class _Handler(BaseHTTPRequestHandler):
         if len(hosts) > 1:
             self.send_error(HTTPStatus.BAD_REQUEST, "a request names one Host")
             return False
-        if self.server.is_meant(*(hosts or [None])):
+        if self.server.is_meant(hosts[0] if hosts else None):
             return True
         self.close_connection = True
         # The name is a stranger's and may be of any bytes: it is not repeated.

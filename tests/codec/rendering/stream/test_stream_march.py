@@ -188,7 +188,7 @@ def test_counters_prove_that_nothing_else_is_done(frame_picture: FramePicture, m
 def test_only_samples_in_visible_cells_are_evaluated(
     frame_picture: FramePicture, planned: Planned, volume: Volume
 ) -> None:
-    narrow = {"transfer_function": {"opacity": [[4, 0], [4.2, 0.1], [4.4, 0]]}}
+    narrow = {"step": 0, "transfer_function": {"opacity": [[4, 0], [4.2, 0.1], [4.4, 0]]}}
     found, everything = (
         frame_picture("arm", {**narrow, "march": {"skipping": on, "threshold": 0.0}})
         for on in (True, False)
