@@ -210,7 +210,7 @@ def test_one_line_and_nothing_written(
 
 @pytest.mark.filterwarnings("default")
 def test_a_picture_without_ink_says_so_and_the_step_is_told(fhash: Fhash, tmp_path: Path) -> None:
-    values = np.full((3, 8, 8, 8), 3, np.float32)
+    values = np.full((3, 10, 10, 10), 3, np.float32)
     fhash_codec.encode(values, tmp_path / "flat.fhz", fhash_codec.EncodeConfig(effort=1))
     words = ("-o", tmp_path / "a.png", "--size", "20", "--force")
     empty = fhash("render", tmp_path / "flat.fhz", *words, "-q")
