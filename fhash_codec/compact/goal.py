@@ -143,6 +143,13 @@ class Bracket:
         return self.middle(self.low, self.high)
 
 
+FLAT_STEPS = 0.5
+"""Difference of two log steps from which on their bytes say whether coarser ones save more."""
+FLAT = 0.01
+"""Share of the bytes that such a coarser step saves at least. Usually it saves a third; where it
+does not, tiles are nearly empty, and what they take beside their values is too much."""
+
+
 class SizeSearch:
     """Search for the quantiser step at which tiles take a number of bytes.
 
@@ -166,6 +173,9 @@ class SizeSearch:
         self._target, self._drifts = target, drifts
         self._fall = USUAL_FALL
         self._before: tuple[float, int] | None = None
+        self._coarsest: tuple[float, int] | None = None
+        self.is_flat = False
+        """Whether coarser steps have saved hardly any of the bytes, which are too many."""
 
     def inside(self, log_step: float) -> float:
         """Return the nearest log step within what the search allows."""
@@ -177,6 +187,10 @@ class SizeSearch:
         too_fine: whether these bytes are too many.
         """
         self._bracket = self._bracket.narrowed(log_step, too_low=too_fine)
+        if too_fine and (self._coarsest is None or log_step > self._coarsest[0]):
+            if self._coarsest is not None and log_step > self._coarsest[0] + FLAT_STEPS:
+                self.is_flat = size > (1 - FLAT) * self._coarsest[1]
+            self._coarsest = log_step, size
         if self._before is not None:
             log_step_before, size_before = self._before
             if (log_step_before - log_step) * (size - size_before) > 0:
