@@ -459,28 +459,29 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
 
 
 def _fullest_step(volume: Volume, plan: Plan) -> int:
-    """The step of LOOKED_AT of them whose neighbouring vertices look most different.
-
-    What a vertex looks like is its opacity and, where it has some, its place in the colours; the
-    differences are of a coarse level of detail. The earliest of equal steps is taken.
-    """
-    last = volume.shape[0] - 1
-    steps = sorted({round(last * share) for share in np.linspace(0, 1, LOOKED_AT)})
-    function = plan.function
-    low, high = function.colours.positions[[0, -1]]
+    """The step of most structure among LOOKED_AT of them, the earliest of equal ones."""
+    last, parts = volume.shape[0] - 1, LOOKED_AT - 1
     most, best = 0.0, 0
-    for step in steps:
-        values = _coarse(volume, step, GLANCE)
-        opacity = function.opacity(values)
-        with np.errstate(over="ignore", invalid="ignore"):
-            colour = np.clip((values - low) / (high - low), 0, 1)
-        looks = np.where(opacity > 0, opacity * (1 + colour), 0.0)
-        for surface in plan.scene.effects.isosurfaces:
-            looks = looks + np.where(values >= surface.value, surface.opacity, 0.0)
-        found = sum(float(np.abs(np.diff(looks, axis=axis)).sum()) for axis in range(3))
-        if found > most * (1 + 1e-6):
+    for step in sorted({(2 * last * part + parts) // (2 * parts) for part in range(LOOKED_AT)}):
+        found = structure(_coarse(volume, step, GLANCE), plan)
+        if found > most * (1 + 1e-6):  # beyond the rounding of sums
             most, best = found, step
     return best
+
+
+def structure(values: npt.NDArray[Any], plan: Plan) -> float:
+    """How different neighbouring vertices (z, y, x) look in a picture.
+
+    What a vertex looks like is its opacity and, where it has some, its place in the colours.
+    """
+    low, high = plan.function.colours.positions[[0, -1]]
+    opacity = plan.function.opacity(values)
+    with np.errstate(over="ignore", invalid="ignore"):
+        colour = np.clip((values - low) / (high - low), 0, 1)
+    looks = np.where(opacity > 0, opacity * (1 + colour), 0.0)
+    for surface in plan.scene.effects.isosurfaces:
+        looks = looks + np.where(values >= surface.value, surface.opacity, 0.0)
+    return sum(float(np.abs(np.diff(looks, axis=axis)).sum()) for axis in range(3))
 
 
 def _coarse(volume: Volume, step: int, vertices: int) -> npt.NDArray[Any]:

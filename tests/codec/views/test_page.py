@@ -36,7 +36,7 @@ from fhash_cli.main import program
 from fhash_codec import EncodeConfig
 from fhash_codec.native import network
 from fhash_codec.rendering.colours import COLOUR_MAPS
-from fhash_codec.rendering.renderer import Renderer
+from fhash_codec.rendering.renderer import Renderer, structure
 from fhash_codec.rendering.scenes import SCENE_KEY, Scene, scene_in_png, text_in_png
 from fhash_codec.views.page import FOLDER, PRIORS, WIDGET, Page, embedded
 from fhash_codec.views.server import Server
@@ -333,6 +333,25 @@ def test_a_network_keeps_its_promise_in_every_reader(
         error = np.sqrt(np.mean((decoded - values) ** 2)) / np.ptp(values)
         assert -20 * np.log10(error) >= psnr, name
         assert np.abs(decoded - readers["libfhash"]).max() <= most
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="there is no node")
+def test_the_page_chooses_the_step_of_render(steady: Path) -> None:
+    surface = {"value": 20.0, "opacity": 0.5}
+    scene = Scene.from_dict({"step": 0, "effects": {"isosurfaces": [surface]}})
+    with fhash_codec.open(steady) as volume:
+        plan = Renderer(volume).plan(scene)
+        frames = [volume.read_lod(step, 0) for step in (0, 3)]
+    job = {
+        "frames": [frame.ravel().tolist() for frame in frames],
+        "shape": frames[0].shape,
+        "points": plan.function.points.tolist(),
+        "positions": plan.function.colours.positions.tolist(),
+        "surfaces": [surface],
+    }
+    words = ["node", Path(__file__).with_name("structure.mjs"), FOLDER]
+    done = subprocess.run(words, input=json.dumps(job), capture_output=True, text=True, check=True)
+    np.testing.assert_allclose(json.loads(done.stdout), [structure(each, plan) for each in frames])
 
 
 def read_natively(
