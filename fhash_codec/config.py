@@ -15,7 +15,7 @@ from fhash_codec.records import Record, limits
 from fhash_formats.errors import InputError, suggestion
 
 TABLES = ("auto", "float32", "float16", "uint8", "sparse", "dense", "transform")
-"""Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""
+"""Storage of the paper profile's tables: the codec, a number type, or float16 of some vertices."""
 
 NAMED_PROFILES = {"lattice": "compact", "network": "paper"}
 """Profiles by the names of what they fit."""
@@ -45,6 +45,8 @@ ACCESSES = ("fast", "balanced", "small")
 PAIR = ("psnr", "psnr_bulk")
 """Promises that may be given together."""
 
+TRAIN_ON_SECONDS = 3600
+"""Seconds that a training may go on for a promise: as long as a person may wait for one file."""
 DEFAULT_PSNR = 50.0
 """PSNR in dB that is promised where nothing is asked for."""
 DEFAULT_PSNR_BULK = 40.0
@@ -112,15 +114,16 @@ class EncodeConfig(Record):
     )
     epochs: int = limits(
         0,
-        "paper: passes over the coreset, 0 for 20 or as many as make 1000 training steps",
+        "paper: passes over the coreset, no fewer and no more; 0 for 20 or as many as make 1000 "
+        "training steps, and then more until the promise is kept",
         low=0,
         high=100_000,
         profile="paper",
     )
     train_on_seconds: int = limits(
-        3600,
-        "paper: time that training may take beyond its epochs where coded tables would miss "
-        "--psnr or --psnr-bulk",
+        TRAIN_ON_SECONDS,
+        "paper: seconds of wall time that training may take beyond its first epochs where coded "
+        "tables would miss the promise; --epochs leaves none",
         low=0,
         high=10**9,
         profile="paper",
@@ -149,27 +152,28 @@ class EncodeConfig(Record):
     psnr: float | None = limits(
         None,
         "promise of quality in dB over the coreset of all steps "
-        f"(compact: {DEFAULT_PSNR:g} if nothing is promised); missing it ends with exit code 3",
+        f"({DEFAULT_PSNR:g} if nothing is promised); a file that misses it is RUN.missed.fhz, and "
+        "the exit code 3",
         low=0.0,
         high=400.0,
     )
     psnr_bulk: float | None = limits(
         None,
         "promise of quality in dB within the bulk, the range of the middle 98 % of the values "
-        f"(compact: {DEFAULT_PSNR_BULK:g} if nothing is promised); alone or beside psnr",
+        f"({DEFAULT_PSNR_BULK:g} if nothing is promised); alone or beside psnr",
         low=0.0,
         high=400.0,
     )
     max_error: float | None = limits(
         None,
-        "strict bound of the error of each value, in data units; for a network (paper), what it "
-        "lacks is coded beside it as a lattice",
+        "compact: strict bound of the error of each value, in data units",
         low=0.0,
         high=1.7e308,
     )
     max_error_rel: float | None = limits(
         None,
-        "strict bound of the error of each value, as a fraction of the range of the series",
+        "compact: strict bound of the error of each value, as a fraction of the range of the "
+        "series",
         low=0.0,
         high=1.0,
     )
@@ -209,10 +213,10 @@ class EncodeConfig(Record):
     )
     tables: str = limits(
         "auto",
-        "paper: number type of the stored tables, which have only the vertices that the coreset "
-        "needs where it is below half of its box; 'sparse' (always so) and 'dense' (never) are "
-        "float16; 'transform' codes them as compact does, for at most 0.1 dB or down to --psnr or "
-        "--psnr-bulk; 'auto' does that where one of these is given, and is float16 elsewhere",
+        "paper: 'auto' codes the tables as compact does, down to the promise; 'transform' too, for "
+        "at most 0.1 dB where none is given; others are plain numbers of a type, which have only "
+        "the vertices that the coreset needs where it is below half of its box; 'sparse' (always "
+        "so) and 'dense' (never) are float16; only 'auto' has a promise where none is given",
         choices=TABLES,
         profile="paper",
     )
@@ -243,6 +247,11 @@ class EncodeConfig(Record):
             )
         self._check_profile()
         self._check_without()
+        if self.epochs and self.train_on_seconds not in (0, TRAIN_ON_SECONDS):
+            raise InputError(
+                "epochs and train-on-seconds are given; --epochs trains no more than that: "
+                "give one of them"
+            )
         if self.access != "balanced" and self.tile != "auto":
             raise InputError(
                 f"access '{self.access}' and tile '{self.tile}' are given; a tile that is named "
@@ -258,15 +267,11 @@ class EncodeConfig(Record):
 
     @property
     def coded(self) -> bool:
-        """Whether the profile paper's tables are coded: `tables`, or what its auto stands for."""
-        promised = any(getattr(self, name) is not None for name in PROMISES)
-        return self.tables == "transform" or (self.tables == "auto" and promised)
+        """Whether the profile paper's tables are coded, and no plain numbers."""
+        return self.tables in ("auto", "transform")
 
     def of_profile(self, profile: str) -> EncodeConfig:
-        """The settings for one profile, without those of the other.
-
-        A network without a promise gets the default one, so that it can be compared.
-        """
+        """The settings for one profile, without those of the other."""
         changes: dict[str, Any] = {
             field.name: field.default
             for field in dataclasses.fields(self)
@@ -274,8 +279,6 @@ class EncodeConfig(Record):
         }
         if profile == "paper":
             changes["without"] = tuple(name for name in self.without if name in STAGES_OF_PAPER)
-            if not any(getattr(self, name) is not None for name in PROMISES):
-                changes["psnr"] = DEFAULT_PSNR
         return dataclasses.replace(self, profile=profile, **changes)
 
     @property
@@ -371,6 +374,12 @@ class EncodeConfig(Record):
         if len(promised) > 1 and not {field.name for field in promised} <= set(PAIR):
             names = " and ".join(map(self.label, promised))
             raise InputError(f"{names} are given; promise one of them")
+        if self.profile == "paper" and self.bounded:
+            raise InputError(
+                f"{self.label(promised[0])} is not for --profile network, whose float32 numbers "
+                "differ from machine to machine; leave --profile out for a bound (networks take "
+                "one again once their weights are integers), or promise --psnr"
+            )
 
 
 def options_beyond(

@@ -15,35 +15,30 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.encode import DecodedTiles, code_series, encode_compact
+from fhash_codec.compact.encode import DecodedTiles, encode_compact
 from fhash_codec.compact.goal import missed_promise, remarks
-from fhash_codec.compact.tiles import fits_memory
 from fhash_codec.comparison import EncodeReport, Sizes, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import AUTO, EncodeConfig
 from fhash_codec.dataset import Dataset
 from fhash_codec.devices import choose_device
-from fhash_codec.features.selection import Source, mask_files, open_source, select_features
+from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import brief_quality, check_name
-from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.paper.encode import coded_bound, encode_paper
+from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, recording, silent, skip, stage
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Container, ContainerWriter
-from fhash_formats.container.header import RESIDUAL, TRANSFORM_FEATURE
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.readers.labelled import labelled_series, list_dataset
 from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.registry import list_variables, open_series
-from fhash_formats.series import AXES, ArraySeries, Series, index_coordinate, shown_name
+from fhash_formats.series import Series, shown_name
 from fhash_formats.support.files import check_output
 from fhash_formats.support.values import json_attributes
 
 DECODED_AGAIN = 8
 """Tiles of which one is decoded from the file where the encoder knows their decoded values."""
 _NONE_DECODED: DecodedTiles = {}
-RESIDUAL_EFFORT = 3
-"""Effort of the lattice: what a network lacks is noise, of which a head learns nothing."""
 PREDICTED = ("seconds", "bytes", "psnr")
 """Figures of a prediction that a header keeps."""
 
@@ -80,10 +75,9 @@ def encode(
     starts again.
 
     Raises InputError for a source or settings that cannot be encoded, or for a promise that is seen
-    to be out of reach, and MissingDependencyError for CUDA without torch. Raises
-    QualityError, with the figures of the file in the error, if the file
-    misses what the settings promise. It is written nevertheless: as `path` where that is free; an
-    older file stays as it is, and the new one is written beside it (`missed_path`). Warns
+    to be out of reach, and MissingDependencyError for CUDA without torch. Raises QualityError, with
+    the figures of the file in the error, if the file misses what the settings promise. It is
+    written beside `path`, as RUN.missed.fhz (`missed_path`); an older `path` stays as it is. Warns
     (FhashWarning) where the bulk of the values is far worse than an explicit promise sounds. Raises
     ClusterError where a worker of `client` fails.
     """
@@ -95,7 +89,7 @@ def encode(
         check_output(path, force, sources=[*series.files, *mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
             encoded = encode_variable(writer, series, config, mask, path, progress)
-            if encoded.missed is not None and os.path.lexists(path):
+            if encoded.missed is not None:
                 writer.divert(missed_path(path))
             written = writer.path
             progress("writing", 0, 1, "")
@@ -175,74 +169,22 @@ def encode_variable(
             "has the one to take"
         )
     measured = _Measured(writer, series, config, progress)
-    checkpoint, advice = None, ""
+    checkpoint, advice, rounding = None, "", 0.0
     if config.profile == "compact":
         header = encode_compact(writer, series, config, mask, progress, measured.complete)
     else:
-
-        def complete(header: dict[str, Any]) -> dict[str, Any]:
-            return measured.complete(_with_residual(writer, series, config, header, progress))
-
-        header, checkpoint, advice = encode_paper(
-            writer, series, config, mask, path, progress, complete
-        )
+        network = encode_paper(writer, series, config, mask, path, progress, measured.complete)
+        header, checkpoint = network.header, network.checkpoint
+        advice, rounding = network.advice, network.rounding
     figures = measured.figures(header)
     return EncodedVariable(
         header=header,
         quality=measured.quality,
         ratio=figures["ratio"],
         checkpoint=checkpoint,
-        missed=missed_promise(config, figures),
+        missed=missed_promise(config, figures, rounding),
         advice=advice,
     )
-
-
-def _with_residual(
-    writer: ContainerWriter,
-    series: Series,
-    config: EncodeConfig,
-    header: dict[str, Any],
-    progress: Progress,
-) -> dict[str, Any]:
-    """Code and write what a written network lacks of a series, where a bound is promised.
-
-    header: of what is written.
-
-    Returns the header with what it says of the residual.
-    """
-    bound = coded_bound(config, series, ValueRange(*header["value_range"]))
-    if bound is None:
-        return header
-    told = "what the network lacks, coded as a lattice within the bound"
-    with stage("residual", told), Volume(writer.preview(header)) as volume:
-        lacking: Series = _Lacking(series, volume)
-        if fits_memory(lacking):
-            lacking = ArraySeries(lacking.read_steps(range(lacking.shape[0])))
-        coding = EncodeConfig(max_error=bound, effort=RESIDUAL_EFFORT, seed=config.seed)
-        selection = select_features(lacking, coding, progress, ranked=not fits_memory(lacking))
-        table = code_series(lacking, selection, coding, progress)
-    table.parts.write(writer, RESIDUAL)
-    needed = [*header.get("required_features", ()), TRANSFORM_FEATURE, RESIDUAL]
-    return header | {"required_features": list(dict.fromkeys(needed))}
-
-
-class _Lacking(Series):
-    """Errors of a volume, in its box (z, y, x) at each step; 0 where no value counts."""
-
-    def __init__(self, series: Series, volume: Volume) -> None:
-        self._series, self._volume = series, volume
-        self.source, self.name, self.units, self.attributes = series.source, RESIDUAL, "", {}
-        z, y, x = volume.box.shape
-        self.shape = (series.shape[0], z, y, x)
-        self.dtype = volume.float_dtype
-        lengths = zip(AXES, self.shape, strict=True)
-        self.coords = {axis: index_coordinate(axis, length) for axis, length in lengths}
-
-    def read(self, step: int) -> npt.NDArray[Any]:
-        box = self._volume.box
-        frame = self._series.read(step)[box.slices()].astype(np.float64)
-        lacking = frame - self._volume.read(step, box)
-        return np.where(self._volume.occupancy(step, box), lacking, 0.0).astype(self.dtype)
 
 
 @contextmanager
@@ -342,7 +284,7 @@ def _take_decoded(container: Container, decoded: DecodedTiles) -> None:
 
 
 def missed_path(path: Path) -> Path:
-    """The name of a file that misses its promise, beside an older file `path` that stays.
+    """The name of a file that misses its promise, so that `path` never names one.
 
     It is RUN.missed.fhz for RUN.fhz, or RUN.missed-2.fhz and so on where that exists.
     """
@@ -357,8 +299,7 @@ def missed_path(path: Path) -> Path:
 
 def missed_text(path: Path, written: Path, missed: str, advice: str) -> str:
     """The message of a missed promise: what was missed, where the file is, and what may help."""
-    where = "the file is written" if written == path else f"it is kept, the new file is {written}"
-    return f"{path}: {missed}; {where}" + (f". {advice}" if advice else "")
+    return f"{path}: {missed}; the file is {written}" + (f". {advice}" if advice else "")
 
 
 Configs = EncodeConfig | Mapping[str, EncodeConfig]
@@ -418,7 +359,7 @@ def encode_dataset(
             # A function of its own, so that nothing of a variable is held with the next one.
             encoded[name], stages[name] = _encoded(sources, name, writer, configs[name], path, told)
         missed = [name for name in names if encoded[name].missed is not None]
-        if missed and os.path.lexists(path):
+        if missed:
             writer.divert(missed_path(path))
         written = writer.path
         progress("writing", 0, 1, "")

@@ -155,12 +155,6 @@ class CardOccupancy(Stored):
     apart: Annotated[list[str], "features that have bits of their own; empty where merged, or one"]
 
 
-class CardResidual(Stored):
-    """The values that a network lacks, at every vertex of the box and step."""
-
-    shape: Annotated[list[int], "steps, z, y, x"]
-
-
 class ModelCard(TypedDict):
     """The parts of a model and where they lie in the file."""
 
@@ -168,7 +162,6 @@ class ModelCard(TypedDict):
     tables: Annotated[list[CardTable], "levels, finest first"]
     mlp: Annotated[list[CardLayer], "layers; empty where there is no network"]
     occupancy: Annotated[CardOccupancy, "bits of the coreset"]
-    residual: NotRequired[Annotated[CardResidual, "what a network lacks, where it has a bound"]]
 
 
 class VolumeInfo(FileInfo):

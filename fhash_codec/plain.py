@@ -30,7 +30,6 @@ from fhash_formats.container.header import (
     LAYERS,
     MASK_ARRAY,
     PLAIN_FEATURE,
-    RESIDUAL,
     SPARSE,
     STEPS,
 )
@@ -152,8 +151,7 @@ class _Export:
             **self._header,
             "coordinates": {},
             "model": {key: model[key] for key in model if key != SPARSE} | changed,
-            # tables that are numbers need no feature, and a residual is still one
-            "required_features": [RESIDUAL] if RESIDUAL in self._arrays else [],
+            "required_features": [],  # tables that are numbers need none
         }
 
     def compact(self) -> dict[str, Any]:

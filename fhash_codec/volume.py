@@ -28,7 +28,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
 from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
-from fhash_formats.container.header import EVERYTHING, RESIDUAL
+from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError, MissingDependencyError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
@@ -227,8 +227,6 @@ class Volume(Card, ArrayLike):
         every_step = header["model"]["levels"][0][0] == self.shape[0]
         self._outside_is_missing = every_step and EVERYTHING in header["features"]
         self._model = open_model(container)
-        corrected = RESIDUAL in header["required_features"]
-        self._residual = CompactModel(container, RESIDUAL) if corrected else None
         self.chunks = self._model.chunks
 
     def _decoded(self, ranges: Sequence[range]) -> npt.NDArray[Any]:
@@ -282,11 +280,8 @@ class Volume(Card, ArrayLike):
         def decode(in_box: Box) -> Decoded:
             requested = self._occupied(key, in_box)
             values = self._model.read(key, in_box, requested)
-            if self._residual is not None:
-                values = values + self._residual.read(t, in_box, requested)
             values = values.astype(self.float_dtype, copy=False)
-            stored = key.is_integer() and self._residual is None
-            return (values if stored else self._in_range(values)), requested
+            return (values if key.is_integer() else self._in_range(values)), requested
 
         return self._completed(decode, region, self._missing_at(t, region), outside)
 

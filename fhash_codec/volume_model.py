@@ -16,7 +16,7 @@ from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
 from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
-from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, RESIDUAL, TABLE
+from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.values import Mask
@@ -64,7 +64,6 @@ class Card:
     shape: tuple[int, int, int, int]
     box: Box
     _model: VolumeModel
-    _residual: CompactModel | None
 
     if TYPE_CHECKING:
 
@@ -128,7 +127,7 @@ class Card:
         decoded from the tiles of level 1, and an occupancy that is the whole box.
         """
         settings = len(self.config)
-        card: ModelCard = {
+        return {
             "config": {
                 "path": "zarr.json",
                 "coding": "JSON, deflated",
@@ -147,10 +146,6 @@ class Card:
             "mlp": self._describe_mlp(),
             "occupancy": self._describe_occupancy(),
         }
-        if self._residual is not None:
-            shape = list(self.container.arrays[RESIDUAL].shape)
-            card["residual"] = {"shape": shape, **self._stored(RESIDUAL, "")}
-        return card
 
     def _describe_mlp(self) -> list[CardLayer]:
         """The layers: in arrays of their own, all in one, or packed in the coded table."""
@@ -246,19 +241,12 @@ class Card:
         if inside.any():
             first = self.box.first
             local = [(along - low)[inside] for along, low in zip(space, first, strict=True)]
-            residual = self._residual
             if slopes is None:
                 values[inside] = self._model.sample(keys[inside], local)
-                if residual is not None:
-                    values[inside] += residual.sample(steps[inside], local)
             else:
                 found = self._model.sample_with_gradient(keys[inside], local)
                 values[inside], slopes[inside] = found
                 slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
-                if residual is not None:
-                    more, by = residual.sample_with_gradient(steps[inside], local)
-                    values[inside] += more
-                    slopes[inside] += by
         return values, slopes
 
 

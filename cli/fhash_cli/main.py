@@ -177,7 +177,7 @@ def program(context: click.Context) -> None:
       0    success
       1    failure: a full disk, no memory, a check of selftest that does not hold
       2    usage, or an unsuitable input
-      3    a promise of quality or a gate missed; the file is written
+      3    a promise of quality or a gate missed; such a file is RUN.missed.fhz, never RUN.fhz
       4    a damaged or unsupported file
       130  interrupted by Ctrl-C
 

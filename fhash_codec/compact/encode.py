@@ -222,6 +222,8 @@ def code_to_size(table: CodedTable, window: ByteWindow, code_all: CodeAll) -> Co
         if window.holds(table) or (size < window.low and is_exact(table)):
             return None
         log_step = steps.after(math.log(settings.step), size, too_fine=size > window.high)
+        if steps.is_flat:
+            return None
         return replace(plan, settings=with_step(settings, math.exp(log_step), plan.goal))
 
     return search(table, following, code_all, SIZE_PASSES, window.prefers)

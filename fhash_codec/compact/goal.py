@@ -143,6 +143,13 @@ class Bracket:
         return self.middle(self.low, self.high)
 
 
+FLAT_STEPS = 0.5
+"""Difference of two log steps from which on their bytes say whether coarser ones save more."""
+FLAT = 0.01
+"""Share of the bytes that such a coarser step saves at least. Usually it saves a third; where it
+does not, tiles are nearly empty, and what they take beside their values is too much."""
+
+
 class SizeSearch:
     """Search for the quantiser step at which tiles take a number of bytes.
 
@@ -166,6 +173,9 @@ class SizeSearch:
         self._target, self._drifts = target, drifts
         self._fall = USUAL_FALL
         self._before: tuple[float, int] | None = None
+        self._coarsest: tuple[float, int] | None = None
+        self.is_flat = False
+        """Whether coarser steps have saved hardly any of the bytes, which are too many."""
 
     def inside(self, log_step: float) -> float:
         """Return the nearest log step within what the search allows."""
@@ -177,6 +187,10 @@ class SizeSearch:
         too_fine: whether these bytes are too many.
         """
         self._bracket = self._bracket.narrowed(log_step, too_low=too_fine)
+        if too_fine and (self._coarsest is None or log_step > self._coarsest[0]):
+            if self._coarsest is not None and log_step > self._coarsest[0] + FLAT_STEPS:
+                self.is_flat = size > (1 - FLAT) * self._coarsest[1]
+            self._coarsest = log_step, size
         if self._before is not None:
             log_step_before, size_before = self._before
             if (log_step_before - log_step) * (size - size_before) > 0:
@@ -372,18 +386,32 @@ DECIDED = 0.3
 """dB by which a PSNR must exceed its promise, and the other one may, where that one decided."""
 
 
-def missed_promise(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+def missed_promise(
+    config: EncodeConfig, figures: Mapping[str, Any], rounding: float = 0.0
+) -> str | None:
     """Text on a promise that a file misses; None if it keeps what the settings promise.
 
     figures: of the file, as in `report`; `promised` has what its header says was promised.
+    rounding: difference between values of two readers at most, as a share of the range.
     """
-    promised = figures["promised"]
+    promised, whole = figures["promised"], (figures["psnr"], figures["rmse"])
     return (
         _missed_bound(config, figures)
-        or _missed_psnr(promised.get("psnr"), figures["psnr"], figures["rmse"], "the coreset")
-        or _missed_bulk(promised.get("psnr_bulk"), figures)
+        or _missed_psnr(promised.get("psnr"), *whole, rounding, "the coreset")
+        or _missed_bulk(promised.get("psnr_bulk"), figures, rounding)
         or _missed_ratio(config, figures)
     )
+
+
+def held_psnr(psnr: float | None, rounding: float) -> float:
+    """Return the PSNR in dB that every reader has at least, by that of one (None for no error).
+
+    Root mean squares add up at most.
+
+    rounding: as in `missed_promise`, of the range that the PSNR is relative to.
+    """
+    error = (0.0 if psnr is None else 10 ** (-psnr / 20)) + rounding
+    return -20 * math.log10(error) if error else math.inf
 
 
 def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
@@ -393,8 +421,8 @@ def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
     """
     bulk = figures["quality"]["bulk"]
     psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
-    trained = config.profile == "paper" and config.psnr is None
-    if config.psnr_bulk is None and not trained and None not in (psnr, psnr_bulk):
+    plain = config.profile == "paper" and not config.coded
+    if config.psnr_bulk is None and not plain and None not in (psnr, psnr_bulk):
         enough = min(DEFAULT_PSNR_BULK, psnr - FAR_BELOW)
         if psnr_bulk < enough:
             low, high = bulk["range"]
@@ -464,29 +492,37 @@ def _missed_bound(config: EncodeConfig, figures: Mapping[str, Any]) -> str | Non
 
 
 def _missed_psnr(
-    promised: float | None, psnr: float | None, rmse: float | None, where: str
+    promised: float | None, psnr: float | None, rmse: float | None, rounding: float, where: str
 ) -> str | None:
     """Text on a PSNR below the promised one; None if there is no such promise or it holds."""
-    if promised is None or rmse == 0:
+    if promised is None:
         return None
-    if psnr is None:
+    if psnr is None and rmse != 0:
         return f"an unknown PSNR over {where}, {promised:g} dB were asked for"
-    if psnr < promised:
-        return f"{psnr:.2f} dB over {where}, {promised:g} dB were asked for"
-    return None
+    held = held_psnr(psnr, rounding)
+    if held >= promised:
+        return None
+    if psnr is None or psnr >= promised:
+        return (
+            f"{held:.2f} dB over {where} in every reader, since float32 rounds otherwise in each, "
+            f"{promised:g} dB were asked for"
+        )
+    return f"{psnr:.2f} dB over {where}, {promised:g} dB were asked for"
 
 
-def _missed_bulk(promised: float | None, figures: Mapping[str, Any]) -> str | None:
+def _missed_bulk(promised: float | None, figures: Mapping[str, Any], rounding: float) -> str | None:
     """Text on a PSNR of the bulk below the promised one; None if there is none or it holds."""
     bulk = figures["quality"]["bulk"]
-    if promised is None or figures["rmse"] == 0:
+    if promised is None or (bulk is None and figures["rmse"] == 0):
         return None
     if bulk is None:
         return (
             "the middle 98 % of the values are all the same, and have no PSNR, "
             f"{promised:g} dB were asked for"
         )
-    return _missed_psnr(promised, bulk["psnr"], bulk["rmse"], "the bulk")
+    low, high = bulk["range"]
+    rounding = rounding * figures["data_range"] / (high - low) if rounding else 0.0
+    return _missed_psnr(promised, bulk["psnr"], bulk["rmse"], rounding, "the bulk")
 
 
 def _missed_ratio(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:

@@ -260,15 +260,15 @@ class PlainArray:
 
 
 class CompactModel:
-    """A `VolumeModel` (volume_model.py) of a compact file, or of the residual of a network.
+    """A `VolumeModel` (volume_model.py) of a compact file.
 
     Its table holds values (t, z, y, x) at the vertices of the feature bounding box.
     """
 
-    def __init__(self, container: Container, name: str = TABLE) -> None:
+    def __init__(self, container: Container) -> None:
         self._container = container
         self._arrays = container.arrays
-        self._table = self._arrays[name]
+        self._table = self._arrays[TABLE]
         self._plain: PlainArray | None = None
         if PLAIN_FEATURE in container.header["required_features"]:
             self._plain = PlainArray(container.header["model"], self._arrays)

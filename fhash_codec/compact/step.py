@@ -309,6 +309,7 @@ def _step_for_size(
         log_step, _, outcome = trial
         if abs(outcome.size - size) < 0.005 * size:
             return None
-        return steps.after(log_step, outcome.size, too_fine=outcome.size > size)
+        following_step = steps.after(log_step, outcome.size, too_fine=outcome.size > size)
+        return None if steps.is_flat else following_step
 
     return search(run(steps.inside(math.log(settings.step))), following, run, 2 * tries + 1)[1:]

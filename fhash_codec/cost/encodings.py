@@ -154,7 +154,9 @@ class OwnEncodings:
         share: share of the time left after which the encoding is stopped, unless it is made always.
         """
         assert wish.config is not None
-        path = self._folder / f"{len(self.files)}.fhz"
+        path, config = self._folder / f"{len(self.files)}.fhz", wish.config
+        if wish.codec == "paper":  # it trains until it keeps its promise
+            config = replace(config, train_on_seconds=int(share * self._allowance.left))
         guarded = self._progress
         if not wish.always:
             guarded = self._allowance.guard(self._progress, share=share)
@@ -162,7 +164,7 @@ class OwnEncodings:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FhashWarning)
-                report = encode(self._series, path, wish.config, force=True, progress=guarded)
+                report = encode(self._series, path, config, force=True, progress=guarded)
         except QualityError as error:
             report, missed = error.figures, True
         except InterruptedEncodingError:  # a training turns Ctrl-C into this
@@ -174,7 +176,8 @@ class OwnEncodings:
             for leftover in self._folder.glob("*.checkpoint"):
                 leftover.unlink()
         measured = encoded_of(report, point, missed=missed)
-        self.files.append(KeptFile(name=measured.name, path=path, psnr=measured.psnr))
+        kept = Path(report["path"])
+        self.files.append(KeptFile(name=measured.name, path=kept, psnr=measured.psnr))
         if report["curve"]:
             self.curves.append(Curve(name=measured.name, points=tuple(report["curve"])))
         if wish.codec == "compact":
@@ -219,7 +222,7 @@ def encoded_of(report: Mapping[str, Any], point: Encoded, *, missed: bool) -> En
 
 CROP_VERTICES = 1 << 19
 """Vertices of the crop to which both models are fitted."""
-SCALED = ("tables", "occupancy", "residual")
+SCALED = ("tables", "occupancy")
 """Groups of arrays that grow with a series; what else a file has does not."""
 DEARER = {"small": 1.0, "balanced": 1.1, "fast": 1.5}
 """Bytes that a model may take for faster regions, as a multiple of the fewest, by the access."""
@@ -302,9 +305,12 @@ def choose_model(
 
     Raises InputError for settings that do not fit the series.
     """
-    if config.ratio is not None:
+    if config.ratio is not None or config.bounded:
+        option = "--ratio" if config.ratio is not None else "a bound"
         chosen = config.of_profile("compact")
-        return ModelChoice(config=chosen, prices=(), crop="", why="only the lattice takes --ratio")
+        return ModelChoice(
+            config=chosen, prices=(), crop="", why=f"only the lattice takes {option}"
+        )
     try:
         part, prices = _prices(series, config, progress)
     except InputError as error:
@@ -353,13 +359,10 @@ def _for_part(config: EncodeConfig, whole: Facts, part: Facts) -> EncodeConfig:
     widths = [
         0.0 if facts.bulk is None else facts.bulk.high - facts.bulk.low for facts in (whole, part)
     ]
-    relative = config.max_error_rel
     return replace(
         config,
         psnr=moved(config.psnr, whole.width, part.width),
         psnr_bulk=moved(config.psnr_bulk, *widths),
-        max_error=config.max_error if relative is None else relative * whole.width,
-        max_error_rel=None,
     )
 
 

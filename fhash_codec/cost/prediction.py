@@ -475,13 +475,13 @@ class Predictor:
             self._trainings[key] = probe_paper(part, share, key)
         probe = self._trainings[key]
         stages = probe.stage_seconds(config)
-        more = config.psnr is not None and config.coded
+        more = config.coded and not config.epochs
         return Prediction(
             seconds=sum(stages.values()),
             bytes=None if config.coded else probe.bytes,
             psnr=None,
             basis=f"two epochs on {_steps(part, self._series)}, in {now() - begun:.1f} s"
-            + ("; further rounds for --psnr are not counted" if more else "")
+            + ("; further rounds for the promise are not counted" if more else "")
             + "; the PSNR is not told before the training",
             stages=stages,
         )

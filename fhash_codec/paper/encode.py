@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from math import inf, isinf, log10, prod
+from dataclasses import dataclass, replace
+from math import isinf, log10, prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.config import EncodeConfig
+from fhash_codec.compact.goal import held_psnr, promise
+from fhash_codec.config import PAIR, EncodeConfig
 from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick, with_steps_between
 from fhash_codec.features.features import Feature, FeatureChoice
 from fhash_codec.features.key_frames import KeyTimes, time_axis
 from fhash_codec.features.scan import Scan
 from fhash_codec.features.selection import resolve_selection
 from fhash_codec.header import brief_history, describe_source, write_series
+from fhash_codec.measure.errors import find_bulk, whole_psnr
 from fhash_codec.measure.value_range import ValueRange, decoded_type
 from fhash_codec.paper.fit import Goal, TrainedModel, train_model
 from fhash_codec.paper.network import Architecture, parameter_count
-from fhash_codec.paper.storage import write_model, write_tables
+from fhash_codec.paper.storage import load_network, write_model, write_tables
 from fhash_codec.progress import Progress, stage
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.header import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
-from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
 
@@ -104,13 +105,6 @@ SPARSE_BELOW = 0.5
 Sparse tables of a share of 0.52 take 0.58 of the memory of dense ones and 0.99 of the file, and a
 point in them takes 1.7 times as long. At 0.22 these are 0.28, 0.97 and 1.7.
 """
-BOUND_SHARE = 1.0
-"""Root mean square of the error that coded tables should have, as a share of a promised bound.
-
-The finer the tables, the more bytes: those of isabel within 1 % grow by 2 % at 0.6.
-"""
-BOUND_LOSS = 3.0
-"""dB that coding may cost a network which has not learned as much, since the residual has it."""
 RESERVE = 0.5
 """dB above a promised PSNR that a model should have before its tables are coded.
 
@@ -120,16 +114,29 @@ Without them the quantiser step would have to be so small that the file is far l
 
 WRITINGS = 3
 """Times that coded tables are written at most until the file keeps its promise."""
-BULK = (0.01, 0.99)
-"""Ends of the bulk, as shares of the values (`measure.errors.find_bulk`)."""
-SMALLEST_BULK = 1e-6
-"""Range of the bulk at least that a promise about it is kept for, as a share of all values'."""
-ROUNDINGS = 2.0
-"""Spacings of the largest value that decoded values may be rounded by, at most."""
+WHOLE = ValueRange(0.0, 1.0)
+"""Range of the coreset's values."""
 EXCESS = 0.1
 """dB above a promise for which coded tables are written once more."""
 NEAR = 0.01
 """dB above a promise at which they aim then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodedNetwork:
+    """A network that is written.
+
+    Attributes:
+        header: complete, with the measured quality.
+        checkpoint: to be removed once the file is complete.
+        advice: what may help where the file misses its promise.
+        rounding: difference between values of two readers at most, as a share of the range.
+    """
+
+    header: dict[str, Any]
+    checkpoint: Path
+    advice: str
+    rounding: float
 
 
 def encode_paper(
@@ -140,7 +147,7 @@ def encode_paper(
     path: Path,
     progress: Progress,
     complete: Callable[[dict[str, Any]], dict[str, Any]],
-) -> tuple[dict[str, Any], Path | None, str]:
+) -> EncodedNetwork:
     """Train the published model on a series and write it.
 
     Args:
@@ -151,19 +158,22 @@ def encode_paper(
         path: the output file, beside which the checkpoint of the training lies.
         progress: called with each step of the work.
         complete: measures what is written, and returns a header with its quality.
-
-    Returns:
-        The header, the checkpoint to remove once the file is complete, and what may help where the
-        file misses its promise.
     """
     selection = select(series, config, progress, mask)
-    coreset = selection.coreset
-    bound = coded_bound(config, series, selection.scanned.value_range)
-    aim = _needed_psnr(selection, config, bound)
+    coreset, value_range = selection.coreset, selection.scanned.value_range
+    counted = coreset.values if coreset.fringe is None else coreset.values[~coreset.fringe]
+    bulk = find_bulk(lambda: iter([counted]), WHOLE)
+    if config.tables == "auto" or any(getattr(config, name) is not None for name in PAIR):
+        about = WHOLE if value_range.low < value_range.high else value_range
+        promised: dict[str, Any] = promise(config, about, bulk)
+        config = replace(config, **promised)
+    aim = _needed_psnr(config, bulk)
     goal = None
-    if aim is not None and bound is None:
+    if aim is not None:
         goal = Goal(psnr=aim + RESERVE, promised=aim, seconds=float(config.train_on_seconds))
     trained = train_model(selection.samples, selection.architecture, config, path, progress, goal)
+    if aim is not None:  # the tables' numbers are about those of the training
+        aim = _with_room(aim, _rounding(series, value_range, trained.rounding))
     with stage("writing", "coordinates, masks, tables, network and header"):
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
     mark = writer.mark()
@@ -172,13 +182,20 @@ def encode_paper(
             writer.rewind(mark)
         header = _written(writer, series, selection, trained, config, aim, progress) | described
         header = complete(header)
-        missing = _missing_psnr(config, header["quality"])
+        with writer.preview(header) as container:
+            rounding = _rounding(series, value_range, load_network(container).rounding())
+        missing = _missing_psnr(config, header["quality"], rounding, value_range)
         if aim is None or isinf(missing) or (missing <= 0 and (writing or missing > -EXCESS)):
             break
         if missing > 0 and trained.psnr is not None and trained.psnr < aim + missing:
             break  # no coding of this model keeps it
         aim += missing + NEAR
-    return header, trained.checkpoint, _advice(selection, series, trained, config)
+    return EncodedNetwork(
+        header=header,
+        checkpoint=trained.checkpoint,
+        advice=_advice(selection, series, trained, config, rounding),
+        rounding=rounding,
+    )
 
 
 def _written(
@@ -197,10 +214,10 @@ def _written(
     coreset, architecture = selection.coreset, selection.architecture
     if config.coded:
         # No other tables need this module.
-        from fhash_codec.paper.table_step import MAX_LOSS, Target, write_coded
+        from fhash_codec.paper.table_step import Target, write_coded
 
         with stage("tables", "coded at a loss that the promise allows"):
-            target = Target(psnr=aim, loss=BOUND_LOSS if config.bounded else MAX_LOSS)
+            target = Target(psnr=aim)
             loss = write_coded(writer, architecture, selection.samples, trained, target, progress)
         vertices = parameter_count(architecture.levels, 1)
         header = _header(series, selection, trained, config, vertices)
@@ -223,39 +240,35 @@ def _written(
     return header | {"required_features": [SPARSE_FEATURE]} if sparse else header
 
 
-def coded_bound(config: EncodeConfig, series: Series, value_range: ValueRange) -> float | None:
-    """Return the bound, in data units, that what the network lacks is coded within, if any.
+def _rounding(series: Series, value_range: ValueRange, rounding: float) -> float:
+    """Return the largest difference of values of two readers, as a share of the range.
 
-    It is the promised one less what the rounding of decoded values may add.
-
-    Raises InputError for one that rounding takes half of.
+    rounding: that of the network's outputs; decoded values are rounded to their type once more.
     """
-    bound = config.max_error
-    if config.max_error_rel is not None:
-        bound = config.max_error_rel * (value_range.high - value_range.low)
-    if bound is None or value_range.low == value_range.high:
-        return None  # a range of one value decodes to it
-    spacing = np.finfo(decoded_type(series.dtype)).eps
-    rounding = ROUNDINGS * float(spacing) * max(map(abs, value_range.floats))
-    if bound <= 2 * rounding:
-        raise InputError(
-            f"{series.source}: an error of {bound:g} is within {2 * rounding:.2g}, to which the "
-            "network's values are rounded; --profile lattice keeps it"
-        )
-    return bound - rounding
+    width = value_range.high - value_range.low
+    if not width:
+        return 0.0
+    spacing = np.spacing(decoded_type(series.dtype).type(max(map(abs, value_range.floats))))
+    return rounding + float(spacing) / width
 
 
-def _missing_psnr(config: EncodeConfig, quality: Mapping[str, Any]) -> float:
+def _with_room(aim: float, rounding: float) -> float:
+    """Return the PSNR in dB at which every reader has `aim`; `aim` where none is enough."""
+    error = 10 ** (-aim / 20) - rounding
+    return -20 * log10(error) if error > 0 else aim
+
+
+def _missing_psnr(
+    config: EncodeConfig, quality: Mapping[str, Any], rounding: float, value_range: ValueRange
+) -> float:
     """Return the dB that a file is short of its promises; below 0 what it has beyond them."""
-    found = [(config.psnr, quality["psnr"])]
-    if quality["bulk"] is not None:
-        found.append((config.psnr_bulk, quality["bulk"]["psnr"]))
-    # Where there is no error there is no PSNR.
-    short = [
-        promised - (inf if psnr is None else psnr)
-        for promised, psnr in found
-        if promised is not None
-    ]
+    short = []
+    if config.psnr is not None:
+        short.append(config.psnr - held_psnr(quality["psnr"], rounding))
+    if config.psnr_bulk is not None and quality["bulk"] is not None:
+        low, high = quality["bulk"]["range"]
+        of_bulk = rounding * (value_range.high - value_range.low) / (high - low)
+        short.append(config.psnr_bulk - held_psnr(quality["bulk"]["psnr"], of_bulk))
     return max(short, default=0.0)
 
 
@@ -263,7 +276,7 @@ def number_type(config: EncodeConfig) -> str:
     """Return the type of the numbers of tables, as the header's `model.tables`."""
     if config.coded:
         return "transform"
-    return "float16" if config.tables in ("auto", "sparse", "dense") else config.tables
+    return "float16" if config.tables in ("sparse", "dense") else config.tables
 
 
 def sparse_tables(coreset: Coreset, config: EncodeConfig) -> bool:
@@ -278,35 +291,40 @@ def sparse_tables(coreset: Coreset, config: EncodeConfig) -> bool:
 
 
 def _advice(
-    selection: Selection, series: Series, trained: TrainedModel, config: EncodeConfig
+    selection: Selection,
+    series: Series,
+    trained: TrainedModel,
+    config: EncodeConfig,
+    rounding: float,
 ) -> str:
     """Return what may help where the file misses its promise, as a sentence without a full stop."""
+    if config.psnr is not None and held_psnr(None, rounding) < config.psnr:
+        return (
+            f"No network of these numbers has more than {held_psnr(None, rounding):.1f} dB in "
+            "every reader, since float32 rounds otherwise in each: leave --profile out"
+        )
     if trained.limited:
         return (
             f"Training ended at its limit of --train-on-seconds {config.train_on_seconds}: "
             "more may help"
         )
+    if config.epochs:
+        return f"--epochs {config.epochs} ended the training; without, it goes on for the promise"
     if len(selection.coreset.key_frames) < series.shape[0]:
         return "The promise is about all steps: more --key-frames may help"
     return "More --epochs may help"
 
 
-def _needed_psnr(selection: Selection, config: EncodeConfig, bound: float | None) -> float | None:
+def _needed_psnr(config: EncodeConfig, bulk: ValueRange | None) -> float | None:
     """Return the PSNR in dB that coded tables need over the samples for the promises, if any.
 
     Within the bulk it counts in the range of that; errors are taken to be alike everywhere.
 
-    bound: of the error in data units, if one is promised.
+    bulk: of the samples.
     """
     needed = [] if config.psnr is None else [config.psnr]
-    low, high = selection.scanned.value_range.floats
-    if bound is not None and high > low:
-        needed.append(-20 * log10(BOUND_SHARE * bound / (high - low)))
-    if config.psnr_bulk is not None:
-        coreset = selection.coreset
-        counted = coreset.values if coreset.fringe is None else coreset.values[~coreset.fringe]
-        low, high = np.quantile(counted, BULK)
-        needed.append(config.psnr_bulk - 20 * log10(max(high - low, SMALLEST_BULK)))
+    if config.psnr_bulk is not None and bulk is not None:
+        needed.append(whole_psnr(config.psnr_bulk, bulk, 1.0))
     return max(needed) if needed and config.coded else None
 
 

@@ -24,7 +24,7 @@ from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines import Engine, describe_engine, make_engine
 from fhash_codec.paper.engines.native import cpu_seconds
 from fhash_codec.paper.engines.parameters import needed_bytes
-from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.network import Architecture, rounding_bound
 from fhash_codec.paper.train import (
     MAX_RESTARTS,
     Breaks,
@@ -198,6 +198,7 @@ class TrainedModel:
         learning_rate: learning rate of the last start.
         limited: whether the limit in time ended the training before its goal.
         psnr: PSNR in dB over the samples; None where it was not measured, or without an error.
+        rounding: of the outputs of two readers, as `rounding_bound` gives it.
     """
 
     fine: npt.NDArray[np.float32]
@@ -213,6 +214,7 @@ class TrainedModel:
     learning_rate: float
     limited: bool
     psnr: float | None
+    rounding: float
 
 
 def train_model(
@@ -328,6 +330,8 @@ class _Fitting:
         if self._goal is None:
             return None
         psnr = self._psnr = Probe(self._coreset).psnr(engine)
+        if self._config.epochs:  # so many were asked for
+            return None
         reached = self._reached
         decision = decide(
             self._goal,
@@ -428,6 +432,7 @@ class _Fitting:
         ):
             raise TrainingError("the trained numbers are not finite; set a lower --learning-rate")
         tables, layers = parameters.dense(self._architecture)
+        peaks = [np.abs(parameters.fine).max(axis=1), *(np.abs(t).max(axis=0) for t in tables)]
         return TrainedModel(
             fine=parameters.fine,
             tables=tables,
@@ -442,4 +447,5 @@ class _Fitting:
             learning_rate=self._reached.rate(self._config.learning_rate),
             limited=self._limited,
             psnr=self._psnr,
+            rounding=rounding_bound(np.concatenate(peaks), layers),
         )

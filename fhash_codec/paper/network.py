@@ -295,6 +295,36 @@ def row_bits(vertices: int) -> int:
 
 Layer = tuple[Single, Single]
 """Weight (out, in) and bias (out,)."""
+UNIT = 2.0**-24
+"""Relative error of one operation in float32, which is rounded to the nearest."""
+INTERPOLATION = 32
+"""Units of the largest embedding by which an interpolated one errs at most.
+
+On each of four axes a weight, its complement, a difference, two products and a sum are rounded:
+together at most 8 units, since the difference may be twice as large.
+"""
+
+
+def rounding_bound(peaks: npt.ArrayLike, layers: Sequence[Layer]) -> float:
+    """Return the largest difference of the outputs of two readers of a network.
+
+    Each evaluates it in float32, in an order of its own, with fused multiply-adds or without. A sum
+    of n products and a bias errs by at most n + 1 units of the sum of their magnitudes (Higham,
+    Accuracy and Stability of Numerical Algorithms, section 3.1). A layer passes on at most the
+    magnitudes of its weights times the errors of its inputs, and ReLU no more than it gets.
+
+    Args:
+        peaks: largest magnitude of each input (inputs,).
+        layers: the layers.
+    """
+    largest = np.asarray(peaks, np.float64)
+    error = INTERPOLATION * UNIT * largest
+    for weight, bias in layers:
+        weights, biases = np.abs(weight).astype(np.float64), np.abs(bias).astype(np.float64)
+        units = (weights.shape[1] + 1) * UNIT
+        error = weights @ error + units / (1 - units) * (weights @ (largest + error) + biases)
+        largest = weights @ largest + biases
+    return 2 * float(error[0])
 
 
 @runtime_checkable
@@ -396,6 +426,19 @@ class Network:
         frame = table.frame(node)
         _check_finite(frame.values, level)
         return frame
+
+    def rounding(self) -> float:
+        """Return the largest difference of the outputs of two readers; see `rounding_bound`."""
+        peaks = []
+        for level, (times, *space) in enumerate(self.levels):
+            peak = np.zeros(self.embedding_size)
+            for node in range(times):
+                frame = self.sparse_frame(level, node)
+                whole = (slice(node, node + 1), *(slice(0, n) for n in space))
+                values = self.read(level, whole) if frame is None else frame.values
+                peak = np.maximum(peak, np.abs(values).reshape(-1, self.embedding_size).max(axis=0))
+            peaks.append(peak)
+        return rounding_bound(np.concatenate(peaks), self.layers)
 
     def _check_tables(self) -> None:
         if not self.levels or len(self.tables) != len(self.levels):

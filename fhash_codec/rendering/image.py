@@ -80,6 +80,7 @@ class Image:
         source: name of the volume's file.
         digest: `Container.digest` of the volume.
         seconds: time that rendering took.
+        ink: share of the view's pixels that differ from the background, before words and frames.
     """
 
     rgba: Single
@@ -90,11 +91,17 @@ class Image:
     source: str = ""
     digest: str = ""
     seconds: float = 0.0
+    ink: float = 1.0
 
     @property
     def background(self) -> str:
         """Background of the scene: '#rrggbb', a name, or 'transparent'."""
         return str(self.scene.get("background", Scene().background))
+
+    def ink_share(self) -> float:
+        """Share of the pixels that differ from the background."""
+        empty = replace(self, rgba=np.zeros((1, 1, 4), np.float32)).to_uint8()
+        return float(np.any(self.to_uint8() != empty, axis=-1).mean())
 
     def to_uint8(self, background: str | None = None) -> npt.NDArray[np.uint8]:
         """Convert to uint8 pixels over a background, that of the scene if None.

@@ -640,13 +640,6 @@ def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
                 "none: its decoded frames are marched on the CPU; leave it out"
             )
         return "cache", "" if march.mode == "cache" else "since the file has no network"
-    if volume._residual is not None:
-        if march.mode in ("arm", "stream") or march.device == "cuda":
-            raise InputError(
-                f"{volume.path} keeps a bound by a residual beside its network: its decoded frames "
-                "are marched on the CPU, and no network alone"
-            )
-        return "cache", "" if march.mode == "cache" else "for the residual beside the network"
     if march.mode == "auto":
         if march.device == "cuda" or (
             march.device == "auto" and arrays_on(march.device) is not NUMPY

@@ -10,6 +10,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -154,6 +155,10 @@ BINS = 512
 """Bins of the histogram of a series."""
 COARSE = 2**18
 """Most vertices of a frame that is read for the histogram, where levels of detail allow it."""
+LOOKED_AT = 5
+"""Steps of a series, evenly spread, that are looked at for the one of most structure."""
+GLANCE = 2**15
+"""Most vertices of a frame that is read to look at it: 32 along each axis show its shape."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -198,6 +203,7 @@ class Renderer:
         self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
         self._histogram: Histogram | None = None
         self._last_plan: tuple[Scene, Plan] | None = None
+        self._fullest: tuple[Any, int] | None = None
         self._background: ThreadPoolExecutor | None = None
         self._prefetch: tuple[Key, Future[_DecodedFrame]] | None = None
         self._process = os.getpid()
@@ -206,7 +212,9 @@ class Renderer:
         """Plan a picture without rendering it; raises InputError or RegionError as `render` does.
 
         A scene that differs from the last one only in its time takes over the rest of that plan.
+        One without a time is planned at the step of most structure (`at_fullest`).
         """
+        scene = self.at_fullest(scene)
         self._choose(scene.features)
         timeless = replace(scene, step=None, time=None)
         if self._last_plan is not None and self._last_plan[0] == timeless:
@@ -214,6 +222,18 @@ class Renderer:
         plan = plan_picture(self.volume, scene, histogram=self.histogram)
         self._last_plan = timeless, plan
         return plan
+
+    def at_fullest(self, scene: Scene) -> Scene:
+        """The scene at the step of most structure, of some, where it says neither step nor time."""
+        several = self.volume.shape[0] > 1 and scene.evolution is None
+        if scene.step is not None or scene.time is not None or not several:
+            return scene
+        plan = self.plan(replace(scene, step=0.0))
+        looks = scene.features, scene.transfer_function, scene.effects.isosurfaces
+        if self._fullest is None or self._fullest[0] != looks:
+            self._finish_prefetch()
+            self._fullest = looks, _fullest_step(self.volume, plan)
+        return replace(scene, step=float(self._fullest[1]))
 
     def render(
         self,
@@ -316,11 +336,16 @@ class Renderer:
         volume = self.volume
         layout = plan.layout
         image = Image(
+            rgba=marched.rgba,
+            scene=plan.scene.to_dict(),
+        )
+        image = replace(
+            image,
+            ink=image.ink_share(),
             rgba=_in_picture(marched.rgba, layout, 0.0),
             depth=None if marched.depth is None else _in_picture(marched.depth, layout, np.inf),
             normal=None if marched.normal is None else _in_picture(marched.normal, layout, 0.0),
             counters=complete(marched.counters, more),
-            scene=plan.scene.to_dict(),
             source=file_name(volume.path),
             digest=volume.container.digest,
         )
@@ -433,6 +458,45 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
     return replace(plan.task, light=light), light.secondary_rays
 
 
+def _fullest_step(volume: Volume, plan: Plan) -> int:
+    """The step of most structure among LOOKED_AT of them, the earliest of equal ones."""
+    last, parts = volume.shape[0] - 1, LOOKED_AT - 1
+    most, best = 0.0, 0
+    for step in sorted({(2 * last * part + parts) // (2 * parts) for part in range(LOOKED_AT)}):
+        found = structure(_coarse(volume, step, GLANCE), plan)
+        if found > most * (1 + 1e-6):  # beyond the rounding of sums
+            most, best = found, step
+    return best
+
+
+def structure(values: npt.NDArray[Any], plan: Plan) -> float:
+    """How different neighbouring vertices (z, y, x) look in a picture.
+
+    What a vertex looks like is its opacity and, where it has some, its place in the colours.
+    """
+    low, high = plan.function.colours.positions[[0, -1]]
+    opacity = plan.function.opacity(values)
+    with np.errstate(over="ignore", invalid="ignore"):
+        colour = np.clip((values - low) / (high - low), 0, 1)
+    looks = np.where(opacity > 0, opacity * (1 + colour), 0.0)
+    for surface in plan.scene.effects.isosurfaces:
+        looks = looks + np.where(values >= surface.value, surface.opacity, 0.0)
+    return sum(float(np.abs(np.diff(looks, axis=axis)).sum()) for axis in range(3))
+
+
+def _coarse(volume: Volume, step: int, vertices: int) -> npt.NDArray[Any]:
+    """Values (z, y, x) of a step at about so many vertices of the box, at most where it can be."""
+    lod = 0
+    while float(np.prod(volume.box.shape)) / 8**lod > vertices:
+        lod += 1
+    if volume.profile == "compact":
+        return volume.read_lod(step, lod)
+    if not lod:
+        return volume.read(step)
+    z, y, x = np.ix_(*(range(low, high, 1 << lod) for low, high in volume.box))
+    return np.asarray(volume.sample(t=step, z=z, y=y, x=x))
+
+
 def _histogram_of(volume: Volume) -> Histogram:
     """Count the finite values of a few steps in BINS bins over the value range."""
     last = volume.shape[0] - 1
@@ -440,17 +504,8 @@ def _histogram_of(volume: Volume) -> Histogram:
     scale = volume.value_range.scale
     edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
     counts = np.zeros(BINS, dtype=np.int64)
-    lod = 0
-    while float(np.prod(volume.box.shape)) / 8**lod > COARSE:
-        lod += 1
-    if volume.profile == "compact":
-        frames = [volume.read_lod(step, lod) for step in sorted({0, last // 2, last})]
-    elif lod:
-        z, y, x = np.ix_(*(range(low, high, 1 << lod) for low, high in volume.box))
-        frames = [np.asarray(volume.sample(t=last // 2, z=z, y=y, x=x))]
-    else:
-        frames = [volume.read(last // 2)]
-    for frame in frames:
+    steps = sorted({0, last // 2, last}) if volume.profile == "compact" else [last // 2]
+    for frame in (_coarse(volume, step, COARSE) for step in steps):
         finite = frame[np.isfinite(frame)]
         if scale != 1:  # beyond float64 where the values are not those of the range
             with np.errstate(over="ignore"):

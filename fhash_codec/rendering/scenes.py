@@ -407,7 +407,8 @@ class Scene(Record):
     background: str = limits("#ffffff", "'#rrggbb', a name, or 'transparent'")
     step: float | None = limits(
         None,
-        "step of the series, between two of them too; the first if neither it nor time is given",
+        "step of the series, between two of them too; of five steps that of most structure if "
+        "neither it nor time is given",
         low=0,
         high=1e15,
     )

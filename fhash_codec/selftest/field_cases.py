@@ -88,7 +88,7 @@ COMPACT: Settings = {
     "psnr": EncodeConfig(psnr=50.0, effort=1),
 }
 EXACT: Settings = {"exact": EncodeConfig(max_error=0.0, effort=1)}
-PAPER: Settings = {"paper": EncodeConfig(profile="paper", width=8, epochs=5)}
+PAPER: Settings = {"paper": EncodeConfig(profile="paper", tables="float16", width=8, epochs=5)}
 QUICK: Settings = {**COMPACT, **PAPER}
 MORE: Settings = {
     **EXACT,
@@ -112,8 +112,12 @@ def of_all(settings: Settings, **changes: Any) -> dict[str, EncodeConfig]:
 
 
 ONE_KEY_FRAME: Settings = {
-    "paper-first": EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0"),
-    "paper-middle": EncodeConfig(profile="paper", width=8, epochs=5, key_frames="2"),
+    "paper-first": EncodeConfig(
+        profile="paper", tables="float16", width=8, epochs=5, key_frames="0"
+    ),
+    "paper-middle": EncodeConfig(
+        profile="paper", tables="float16", width=8, epochs=5, key_frames="2"
+    ),
 }
 ONE_KEY_FRAME_CODED: Settings = {
     f"{name}-transform": config
@@ -228,11 +232,15 @@ STEPS = 6
 SETTINGS: Settings = {
     "bound": COMPACT["bound"],
     **PAPER,
-    "paper-keys": EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,2,5"),
+    "paper-keys": EncodeConfig(
+        profile="paper", tables="float16", width=8, epochs=5, key_frames="0,2,5"
+    ),
 }
 ENDS: Settings = {
     **SETTINGS,
-    "paper-ends": EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,5"),
+    "paper-ends": EncodeConfig(
+        profile="paper", tables="float16", width=8, epochs=5, key_frames="0,5"
+    ),
 }
 EVEN = np.arange(float(STEPS))
 

@@ -371,7 +371,7 @@ def _refused(
 ) -> tuple[list[Finding], list[str]]:
     """Whether the encoding is refused with a message that contains `expected`, and leaves no file.
 
-    An encoding that misses its promise raises QualityError and keeps its file.
+    An encoding that misses its promise raises QualityError and leaves its file beside the name.
     """
     try:
         encode(series, path, config)
@@ -379,7 +379,7 @@ def _refused(
         if expected not in str(error):
             return [], [f"{under}: refused with '{error}', which does not say '{expected}'"]
         left = {entry.name for entry in path.parent.iterdir()} - (
-            {path.name} if isinstance(error, QualityError) else set()
+            {f"{path.stem}.missed{path.suffix}"} if isinstance(error, QualityError) else set()
         )
         return [Finding("refused, nothing left", len(left), 0.0, "files")], []
     except Exception as error:

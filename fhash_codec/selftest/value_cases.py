@@ -509,7 +509,7 @@ _make = single(lambda: waves(GUISE_SHAPE) + 0.02 * noise(GUISE_SHAPE))
 
 GUISE_QUICK: Settings = {
     "bound": EncodeConfig(max_error_rel=1e-2, effort=1),
-    "paper": EncodeConfig(profile="paper", width=16, epochs=30, device="cpu"),
+    "paper": EncodeConfig(profile="paper", tables="float16", width=16, epochs=30, device="cpu"),
 }
 GUISE_MORE: Settings = {
     "absolute": EncodeConfig(max_error=1e-2, effort=1),

@@ -84,10 +84,19 @@ PREFLIGHT = {
 
 Without the last one Chrome keeps pages of the Internet from servers of the own machine.
 """
-BUSY = (
-    b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\n"
-    b"Connection: close\r\n\r\n"
-)
+GUARDS = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Headers of every answer: no page shows it in a frame or takes it for another type."""
+BUSY = "\r\n".join(
+    (
+        "HTTP/1.1 503 Service Unavailable",
+        *("Retry-After: 1", "Content-Length: 0", "Connection: close"),
+        *(f"{name}: {value}" for name, value in GUARDS.items()),
+        *("Cross-Origin-Resource-Policy: same-origin", "", ""),
+    )
+).encode()
 """The answer to a connection beyond MAX_CONNECTIONS."""
 NEWS = Callable[[str], None]
 """Is told a line for each answer that is an error of the server."""
@@ -248,11 +257,22 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.NO_CONTENT, headers={**may, "Allow": "GET, HEAD, OPTIONS"})
 
     def parse_request(self) -> bool:
-        """Read a request; one that is meant for another server is refused."""
+        """Read a request; one with a body, or that is meant for another server, is refused."""
         if not super().parse_request():
             return False
-        host = self.headers.get("Host")
-        if self.server.is_meant(host):
+        if self.request_version == "HTTP/0.9":  # whose answers have no headers
+            self.send_error(HTTPStatus.HTTP_VERSION_NOT_SUPPORTED, "HTTP/1.0 or later is served")
+            return False
+        hosts = self.headers.get_all("Host", [])
+        lengths = self.headers.get_all("Content-Length", [])
+        if "Transfer-Encoding" in self.headers or any(each.strip() != "0" for each in lengths):
+            # What a proxy takes for its body must not be read as the next request.
+            self.send_error(HTTPStatus.BAD_REQUEST, "a request has no body here")
+            return False
+        if len(hosts) > 1:
+            self.send_error(HTTPStatus.BAD_REQUEST, "a request names one Host")
+            return False
+        if self.server.is_meant(hosts[0] if hosts else None):
             return True
         self.close_connection = True
         # The name is a stranger's and may be of any bytes: it is not repeated.
@@ -267,6 +287,7 @@ class _Handler(BaseHTTPRequestHandler):
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Refuse a request that is no HTTP, or of another method, with one line."""
         self.close_connection = True
+        self.request_version = self.protocol_version  # of a request that has none
         status = HTTPStatus(code)
         if status == HTTPStatus.NOT_IMPLEMENTED:
             status, message = HTTPStatus.METHOD_NOT_ALLOWED, "GET, HEAD and OPTIONS are served"
@@ -361,6 +382,8 @@ class _Handler(BaseHTTPRequestHandler):
         if origin is not None:
             self.send_header("Access-Control-Allow-Origin", origin)
             self.send_header("Access-Control-Expose-Headers", EXPOSED)
+        whose = "same-origin" if origin is None else "cross-origin"
+        headers = {**headers, **GUARDS, "Cross-Origin-Resource-Policy": whose}
         if self.server.origins - {"*"}:
             self.send_header("Vary", "Origin")
         for name, value in headers.items():

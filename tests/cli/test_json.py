@@ -82,7 +82,7 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     for settings in (
         ["--effort", "2"],
         ["--effort", "2", "--no-timings", "--missing", repr(float(smallest))],
-        ["--profile", "paper", "--epochs", "1", "--width", "4", "--key-frames", "0,2"],
+        *(["--profile=paper", "--tables=float16", "--epochs=1", "--width=4", "--key-frames=0,2"],),
     ):
         words = ["encode", data, "-o", path, "--force", *settings]
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
@@ -106,7 +106,7 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
     words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]
     outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
-    words[-4:] = ["--profile", "auto", "--max-error-rel", "0.05", "--epochs", "1"]
+    words[-4:] = ["--profile", "auto", "--psnr", "20"]
     outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
     words[words.index("auto")] = "network"
     fhash(*words, "-q")

@@ -30,7 +30,7 @@ from fhash_formats.errors import FhashWarning
 from fhash_formats.readers.registry import open_series
 
 SMALL = ["--effort", "1", "--quiet"]
-PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
+PAPER = ["--profile=paper", "--tables=float16", "--epochs", "1", "--width", "4", "--quiet"]
 
 
 @pytest.fixture

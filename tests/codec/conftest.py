@@ -45,7 +45,12 @@ def encoded(tmp_path_factory: pytest.TempPathFactory) -> tuple[npt.NDArray[np.ge
     values = waves((5, 9, 12, 20))
     path = tmp_path_factory.mktemp("encoded") / "waves.fhz"
     config = EncodeConfig(
-        profile="paper", features=("interval:0.5:2",), key_frames="0,2,4", epochs=40, width=16
+        profile="paper",
+        tables="float16",
+        features=("interval:0.5:2",),
+        key_frames="0,2,4",
+        epochs=40,
+        width=16,
     )
     fhash_codec.encode(values, path, config)
     return values, path

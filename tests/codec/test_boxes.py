@@ -72,13 +72,14 @@ def waves(dtype: str) -> np.ndarray:
     return values.astype(dtype)
 
 
+NETWORK = {"profile": "paper", "tables": "float16", "epochs": 2}
 CASES = {
     "floats with holes": ("f4", {}),
     "a feature": ("f4", {"features": ("interval:0:60",)}),
     "64-bit integers": ("i8", {"max_error": 0.4}),
     "small integers of a feature": ("i2", {"features": ("interval:0:60",)}),
-    "key frames": ("f4", {"profile": "paper", "key_frames": "every:3", "epochs": 2}),
-    "a network": ("f4", {"profile": "paper", "features": ("interval:0:60",), "epochs": 2}),
+    "key frames": ("f4", {**NETWORK, "key_frames": "every:3"}),
+    "a network": ("f4", {**NETWORK, "features": ("interval:0:60",)}),
 }
 
 

@@ -296,7 +296,13 @@ REGIONS = [
 ]
 SETTINGS = {
     "compact": {"effort": 1, "tile": "2x3x4x4"},
-    "paper": {"profile": "paper", "epochs": 2, "width": 8, "key_frames": "0,1,3"},
+    "paper": {
+        "profile": "paper",
+        "tables": "float16",
+        "epochs": 2,
+        "width": 8,
+        "key_frames": "0,1,3",
+    },
     "coded": {"profile": "paper", "epochs": 2, "width": 8, "tables": "transform"},
 }
 
@@ -400,7 +406,9 @@ def test_layers_beyond_the_cache_are_decoded_together(
 
 def test_the_figures_are_those_of_the_file(field, tmp_path) -> None:
     source = field()
-    config = EncodeConfig(profile="paper", features=("interval:50:200",), epochs=8, width=16)
+    config = EncodeConfig(
+        profile="paper", tables="float16", features=("interval:50:200",), epochs=8, width=16
+    )
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         back = volume[...].astype(np.float64)

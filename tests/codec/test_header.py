@@ -73,7 +73,7 @@ def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
 
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
-PAPER = EncodeConfig(profile="paper", epochs=1, width=8, timings=False)
+PAPER = EncodeConfig(profile="paper", tables="float16", epochs=1, width=8, timings=False)
 
 
 def plain_file(path: Path) -> Path:

@@ -74,6 +74,9 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
             "ratio belongs to --profile compact; the profile is paper",
         ),
         ({"profile": "paper", "effort": 1}, "effort belongs to --profile compact"),
+        ({"profile": "network", "max_error": 1.0}, "max-error is not for --profile network"),
+        ({"profile": "paper", "max_error_rel": 0.1}, "max-error-rel is not .* leave --profile out"),
+        ({"profile": "paper", "epochs": 5, "train_on_seconds": 9}, "give one of them"),
         ({"profile": "paper", "tile": "whole"}, "tile belongs to --profile compact"),
         ({"key_frames": [0, 2]}, "key-frames belongs to --profile paper; the profile is compact"),
         *(

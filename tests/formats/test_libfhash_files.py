@@ -15,6 +15,7 @@ from unittest import mock
 import numpy as np
 import numpy.typing as npt
 import pytest
+from rounding import rounding
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume, encoding
@@ -29,8 +30,6 @@ NAMES = sorted(path.stem for path in GOLDEN.glob("*.fhz"))
 TYPES = tuple(DTYPES)
 ARGUMENT, MEMORY, DAMAGED, READ = -1, -2, -3, -5
 UNLIMITED = 0
-PAPER_TOLERANCE = 1e-5
-"""Share of the range by which values of the profile paper may differ: sums in another order."""
 
 Region = Sequence[tuple[int, int]]
 Reader = ctypes.CFUNCTYPE(
@@ -194,8 +193,7 @@ def assert_same(found: npt.NDArray[Any], wanted: npt.NDArray[Any], tolerance: fl
 def assert_equal(file: Opened, number: int, volume: Volume) -> None:
     """Every step, between steps, a region, integers and levels of detail of a variable."""
     facts, (steps, *space) = file.facts()[number], volume.shape
-    width = facts.high - facts.low
-    tolerance = PAPER_TOLERANCE * width if volume.profile == "paper" else None
+    tolerance = rounding(volume) or None
     floats = volume.float_dtype.name
     for step in (*range(steps), *(first + 0.3 for first in range(steps - 1))):
         found = file.read(step, space, number=number, dtype=floats)

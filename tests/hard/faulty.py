@@ -124,7 +124,18 @@ class Server:
 
 COMPACT = ("--effort", "1", "--no-timings", "-q")
 BOUND = ("--max-error", "0.05", "--tile", "2x9x10x12", *COMPACT)
-PAPER = ("--profile", "paper", "--epochs", "2", "--width", "4", "--no-timings", "-q")
+PAPER = (
+    "--profile",
+    "paper",
+    "--tables",
+    "float16",
+    "--epochs",
+    "2",
+    "--width",
+    "4",
+    "--no-timings",
+    "-q",
+)
 PROFILES = {"compact": COMPACT, "paper": PAPER}
 FORMATS = ("npy", "h5", "nc", "zarr", "raw", "vti", "vtr", "pvd", "vtkhdf")
 SHAPE = (4, 9, 10, 12)

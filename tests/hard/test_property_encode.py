@@ -162,7 +162,12 @@ def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
 @example(task=(np.zeros((1, 1, 1, 1)), EncodeConfig(max_error_rel=0.0)))
 @example(task=(FAR, EncodeConfig(features=("interval:0:2e16",), effort=1)))
 @example(task=(FAR, EncodeConfig(features=("interval:2e16:2e19",), effort=1)))
-@example(task=(FAR, EncodeConfig(features=("interval:0:2e16",), profile="paper", epochs=1)))
+@example(
+    task=(
+        FAR,
+        EncodeConfig(features=("interval:0:2e16",), profile="paper", tables="float16", epochs=1),
+    )
+)
 def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
     task: tuple[np.ndarray, EncodeConfig],
 ) -> None:
@@ -180,7 +185,8 @@ def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
             one_line(error)
             assert os.listdir(folder) == []
             return
-        assert os.listdir(folder) == ["a.fhz"]
+        path = Path(figures["path"])
+        assert os.listdir(folder) == ["a.missed.fhz" if missed else "a.fhz"] == [path.name]
         assert figures["bytes"] == path.stat().st_size
         assert figures["raw_bytes"] == values.nbytes
         with Container.open(path) as container:

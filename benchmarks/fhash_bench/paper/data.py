@@ -341,7 +341,10 @@ def gather_data(
         InputError: the settings do not fit the series, or they select nothing.
     """
     config = EncodeConfig(
-        profile="paper", features=(feature_text(name, kind),), key_frames=key_frames
+        profile="paper",
+        tables="float16",
+        features=(feature_text(name, kind),),
+        key_frames=key_frames,
     )
     scanned, keys, features = resolve_selection(series, config, progress, None)
     choice = FeatureChoice(keys, features, DILATION)

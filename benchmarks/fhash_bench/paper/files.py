@@ -6,7 +6,6 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -200,8 +199,10 @@ class _Files:
         config = EncodeConfig.from_dict({**settings, "features": (self.feature,)})
         with tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder:
             path, begun = Path(folder, "file.fhz"), time.perf_counter()
-            with suppress(QualityError):  # the file is written, and its quality is in the result
+            try:
                 fhash_codec.encode(self.series, path, config, progress=self.progress)
+            except QualityError as error:  # its quality is in the result
+                path = Path(error.figures["path"])
             seconds = time.perf_counter() - begun
             with open_volume(path) as volume:
                 info = volume.info

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from math import prod
@@ -179,8 +178,10 @@ def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float)
         for field in dataclasses.fields(EncodeConfig)
         if field.metadata.get("profile", profile) != profile
     }
-    promise = {} if profile == "paper" else {"psnr" if goal == "psnr" else "max_error_rel": asked}
     own = {name: value for name, value in settings.items() if name not in others}
+    if profile == "paper":
+        return EncodeConfig.from_dict({"tables": "float16"} | own | {"profile": profile})
+    promise = {"psnr" if goal == "psnr" else "max_error_rel": asked}
     return EncodeConfig.from_dict(own | {"profile": profile} | promise)
 
 
@@ -208,8 +209,10 @@ class Own:
         path = self._paths.setdefault(config, self._folder / f"{len(self._paths)}.fhz")
 
         def encode() -> None:
-            with suppress(QualityError):  # the file is written, and what it reaches is measured
+            try:
                 fhash_codec.encode(self._series, path, config, force=True)
+            except QualityError as error:  # what it reaches is measured
+                Path(error.figures["path"]).replace(path)
 
         self.times.setdefault(config, []).append(spent(encode))
 

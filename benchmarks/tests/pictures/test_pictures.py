@@ -384,7 +384,9 @@ def test_sizes_are_measured_until_arm_has_lost(
     monkeypatch.setattr(render_module, "LOST", lost)
     path = tmp_path / "a.fhz"
     field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
-    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
+    fhash_codec.encode(
+        field, path, EncodeConfig(profile="paper", tables="float16", epochs=1, width=4)
+    )
     with fhash_codec.open(path) as volume:
         pairs = break_even(volume, Scene(), 1, 16, silent)
     assert [pair.size for pair in pairs] == [4, 8, 16][:count]
@@ -476,7 +478,11 @@ def test_marches_through_a_network_are_measured(
 ) -> None:
     monkeypatch.setattr(render_module, "STREAM_SIZE", 12)
     field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
-    encode(field, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, width=4))
+    encode(
+        field,
+        tmp_path / "a.fhz",
+        EncodeConfig(profile="paper", tables="float16", epochs=1, width=4),
+    )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         result = bench_render(volume, parts=NETWORK_PARTS, size=16, turns=1)
     assert result.refused == {}

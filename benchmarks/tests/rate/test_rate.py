@@ -196,7 +196,7 @@ def test_what_a_filter_refuses_is_said(field: Field) -> None:
 
 def test_own_figures_are_those_of_diff(tmp_path: Path, field: Field) -> None:
     values = field()
-    config = EncodeConfig(profile="paper", epochs=2, width=4)
+    config = EncodeConfig(profile="paper", tables="float16", epochs=2, width=4)
     data_range = float(values.max()) - float(values.min())
     own = Own(ArraySeries(values), data_range, tmp_path)
     trial = own.trial(config)

@@ -461,7 +461,7 @@ def _rows(result: Mapping[str, Any], series: Series) -> list[tuple[str, str]]:
         ("size", compared(result)),
         ("coreset", f"{result['coreset_fraction']:.3%} of the domain"),
         *quality_rows(result),
-        ("encoding", f"{duration(result['seconds'])} on {result['device']}"),
+        ("encoding", f"{duration(result['seconds'])} of wall time, on {result['device']}"),
         ("comparing", duration(result["diff_seconds"])),
     ]
 

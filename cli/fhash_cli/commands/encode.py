@@ -465,7 +465,7 @@ def report_rows(
         *quality_rows(report, units),
         ("model", f"{MODELS[report['profile']]}, {model}, profile {report['profile']}"),
         *loss_rows(report),
-        ("time", f"{duration(report['seconds'])} on {report['device']}"),
+        ("time", f"{duration(report['seconds'])} of wall time, on {report['device']}"),
     ]
 
 

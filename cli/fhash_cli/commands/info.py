@@ -55,7 +55,6 @@ def card_rows(info: Mapping[str, Any], *, verbose: bool) -> list[tuple[str, str]
         *_tables(info["model"], card["tables"], verbose=verbose),
         *_mlp(card["mlp"], verbose=verbose),
         ("occupancy", _occupancy(card["occupancy"])),
-        *([("residual", _stored_as(card["residual"]))] if "residual" in card else []),
     ]
 
 
@@ -467,7 +466,7 @@ def _training(info: VolumeInfo) -> str:
         return "not told" if model["head"] and not told else "none"
     steps = f"{training['steps']:,} steps, " if told else ""
     seconds = training["seconds"]
-    took = "" if seconds is None else f" in {number(seconds, 's', digits=3)}"
+    took = "" if seconds is None else f" in {number(seconds, 's', digits=3)} of wall time,"
     rate = training.get("learning_rate")
     lowered = (
         ""

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import typing
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ from fhash_cli.options import (
 )
 from fhash_cli.output import Progress, emit, extent, number, table
 from fhash_cli.selection import steps_of, time_of
-from fhash_formats.errors import InputError, suggestion
+from fhash_formats.errors import FhashWarning, InputError, suggestion
 from fhash_formats.support.files import file_name
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.scenes import Scene
     from fhash_codec.rendering.tracking import Followed, Tracked
 
+FAINT = 0.01
+"""Share of pixels with ink below which a picture is taken for empty: a square of a tenth of its
+sides."""
 NUMBERS = {2: "A,B", 3: "X,Y,Z"}
 """Placeholders of options that take so many numbers."""
 
@@ -218,8 +222,8 @@ class Setting(NamedTuple):
 
 
 SETTINGS = (
-    Setting("--t", "step", "N", help="step, between two of them too; -1 is the last. Default: the"
-            " first"),
+    Setting("--t", "step", "N", help="step, between two of them too; -1 is the last. Default: of"
+            " five steps the one of most structure"),
     Setting("--time", "time", "T", click.STRING, "a time instead of a step: a number, or a date"
             " such as 2001-02-10T06:00"),
     Setting("--size", "size", kind=SIZE, help="pixels across and down.  [default: 512x512,"
@@ -737,9 +741,13 @@ def command(
         _check_outputs(path, picture, scene, run)
         renderer = Renderer(volume)
         plan = renderer.plan(scene)
+        chosen = plan.scene.step is not None and scene.step is None
         image = renderer.render(plan=plan, progress=progress)
         times = volume.coords["t"]
         time = "" if is_static(times) else f"{plan.step:g}, t = {time_text(times, plan.time)}"
+        time += ", of five steps the one of most structure" if chosen else ""
+        if image.ink < FAINT:
+            _warn_of_a_faint_picture(volume, plan.step, image.ink)
     paths = [str(written) for written in _save(image, path, picture)]
     result: Rendered = {
         "paths": paths,
@@ -754,6 +762,18 @@ def command(
     if picture.explain:
         result["plan"] = plan.to_dict()
     emit(result, _text(plan, image, time, paths, picture.explain), as_json)
+
+
+def _warn_of_a_faint_picture(volume: Volume, step: float, ink: float) -> None:
+    low, high = volume.value_range.low, volume.value_range.high
+    why = "another --t, --opacity or --zoom may show more"
+    if low == high:
+        why = f"all values are {low:g}"
+    warnings.warn(
+        f"{ink:.2%} of the picture's pixels differ from the background at step {step:g}: {why}",
+        FhashWarning,
+        stacklevel=2,
+    )
 
 
 def _check_outputs(path: Path, picture: PictureOptions, scene: Scene, run: str) -> None:

@@ -1,7 +1,7 @@
 // The page: what is shown, and when it is drawn.
 import { parseColour } from "./colours.js";
 import { gridOf } from "./camera.js";
-import { Container, histogram } from "./data.js";
+import { Container, histogram, structure } from "./data.js";
 import { controls } from "./controls.js";
 import { clipped, functionOf, look, smoothingOf, undrawn } from "./look.js";
 import { Marcher } from "./marcher.js";
@@ -16,6 +16,7 @@ const COARSE = 2 ** 16;
 const MOST_VERTICES = 2 ** 26;
 const BINS = 512;
 const COUNTED = 2 ** 18;
+const GLANCE = 2 ** 15;
 const MOST_COUNTED = 16 * 2 ** 20; // bytes of files of which more is read than what is shown
 const MOST_PIXELS = 2 ** 22;
 const BAND_MS = 40;
@@ -94,6 +95,20 @@ export async function choose(number, scene, state = {}) {
   slices.place = state.place ?? null;
   panel.fill();
   await show();
+  if (scene.step == null && scene.time == null) await fullest();
+}
+
+/** Go to the step of most structure of five, as `fhash render` does where none is named. */
+async function fullest() {
+  const { number, container } = app, about = variable(), { box } = about, last = about.shape[0] - 1;
+  if (!last || !app.tf || app.step || app.playing || container.about.size > MOST_COUNTED) return;
+  let lod = 0, most = 0, best = 0;
+  while (lod < about.levels && ((box[1] - box[0]) * (box[3] - box[2]) * (box[5] - box[4])) / 8 ** lod > GLANCE) lod++;
+  for (const step of new Set([0, 1, 2, 3, 4].map((part) => Math.floor((2 * last * part + 4) / 8)))) {
+    const found = structure(await container.frame({ number, step, lod, smoothing: 0 }), app.tf, app.scene.effects?.isosurfaces ?? []);
+    if (found > most * (1 + 1e-6)) [most, best] = [found, step];
+  }
+  if (best && container === app.container && number === app.number && !app.step && !app.playing) await go(best);
 }
 
 /** Take over a scene of `fhash render`, with its time. */

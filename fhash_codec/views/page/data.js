@@ -1,4 +1,5 @@
 // Frames of a container: read in workers, kept, and read ahead.
+import { interpolate } from "./transfer.js";
 
 const MEMORY = Math.min((navigator.deviceMemory ?? 4) * 128, 1024) * 2 ** 20;
 const MAX_WORKERS = Math.max(1, Math.min((navigator.hardwareConcurrency ?? 2) - 1, 4));
@@ -137,6 +138,22 @@ export function histogram({ values }, [low, high], bins) {
     if (value === value) counts[Math.min(Math.max(Math.floor((value - low) * scale), 0), bins - 1)]++;
   }
   return counts;
+}
+
+/** How different neighbouring vertices look: opacity and, where there is some, place in the colours. */
+export function structure({ values, shape }, { points, colours }, surfaces) {
+  const low = colours.positions[0], width = colours.positions.at(-1) - low;
+  const looks = Float64Array.from(values, (value) => {
+    if (value !== value) return 0;
+    const opacity = interpolate(points, value), shown = opacity > 0 ? opacity * (1 + Math.min(Math.max((value - low) / width, 0), 1)) : 0;
+    return surfaces.reduce((sum, one) => sum + (value >= one.value ? one.opacity ?? 1 : 0), shown);
+  });
+  const [, ny, nx] = shape, strides = [ny * nx, nx, 1];
+  let sum = 0;
+  strides.forEach((stride, axis) => {
+    for (let n = 0; n < looks.length; n++) if (Math.floor(n / stride) % shape[axis] + 1 < shape[axis]) sum += Math.abs(looks[n + stride] - looks[n]);
+  });
+  return sum;
 }
 
 /** Value of a frame at a vertex (x, y, z) of the domain; NaN where there is none. */

@@ -270,9 +270,7 @@ COUNTS = "counts"
 """Attribute of a table: number of its vertices at each time node."""
 LAYERS = "mlp/parameters"
 """Name of the array of all layers of a network of coded tables, in place of two of each."""
-RESIDUAL = "residual"
-"""Feature of files of the profile paper with this array: what the network's values lack."""
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE, RESIDUAL})
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE})
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
 COMPACT = "compact"
@@ -410,8 +408,6 @@ def validate_header(header: Mapping[str, Any]) -> None:
     if (profile == COMPACT and not plain) or header["model"]["tables"] == CODED:
         needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
         top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)
-    residual = RESIDUAL in header["required_features"]
-    top.need(profile == PAPER or not residual, "required_features", "no residual of a lattice")
     check_sparse(
         top.record("model"),
         header["required_features"],
@@ -460,7 +456,7 @@ def check_format(top: Record) -> None:
     if unknown:
         raise UnsupportedFileError(
             f"the file needs the feature {unknown[0][:80]!a}, "
-            "which this version does not know; upgrade"
+            "which this version does not know; upgrade, or encode the source again"
         )
 
 

@@ -31,7 +31,6 @@ from fhash_formats.container.header import (
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
     POSITIONS,
-    RESIDUAL,
     SPARSE,
     STEP_BYTES,
     STEP_FIGURES,
@@ -172,9 +171,6 @@ def _required_arrays(
     if compact and PLAIN_FEATURE not in header["required_features"]:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
-    if RESIDUAL in header["required_features"]:
-        box = [high - low for low, high in header["feature_bounding_box"]]
-        yield RESIDUAL, (header["domain"]["shape"][0], *box), ("float32", "float64")
     for number, level in enumerate(model["levels"], start=1):
         if model["tables"] == CODED:
             for component in range(1, model["embedding_size"] + 1):
@@ -351,7 +347,7 @@ def _refuse_options(storage_options: StorageOptions, place: str) -> None:
 CACHE_BYTES = 256 << 20
 """Bytes of decoded chunks that an open container keeps."""
 SPLIT = {
-    "field": ("tables", "corrections", RESIDUAL, "occupancy", "missing"),
+    "field": ("tables", "corrections", "occupancy", "missing"),
     "coordinates": ("coords",),
     "beside": ("auxiliary",),
     "model": ("mlp",),
@@ -362,7 +358,7 @@ SPLIT = {
 class Split(TypedDict):
     """Bytes of a file by what they hold; they add up to its size."""
 
-    field: Annotated[int, "tables, residual, corrections, and which vertices have values"]
+    field: Annotated[int, "tables, corrections, and which vertices have values"]
     coordinates: Annotated[int, "arrays of positions along an axis"]
     beside: Annotated[int, "arrays that the source has beside the values"]
     model: Annotated[int, "layers, and documents of coded tables: head, bases and steps"]

@@ -20,7 +20,7 @@ struct Variable {
     double within[2] = {};  // the least and the greatest float64 within the range
     double background = 0, max_error = 0, psnr = 0;
     Json fill = nullptr;  // a number, or null for none
-    bool compact = false, plain = false, residual = false;
+    bool compact = false, plain = false;
     int64_t features = 1;
     Record model;
     std::string tables;                          // model.tables

@@ -33,7 +33,7 @@ bool read_positions(fhash_file& file, const Variable& variable, int axis, double
 bool find_key(fhash_file& file, const Variable& variable, double step, double& key,
               fhash_error& error);
 
-// Values of the profile compact at a key frame, of its table or of the array `residual`.
+// Values of the profile compact at a key frame.
 bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice& lattice,
                 Frame& frame, fhash_error& error);
 // The same of a plain file (plain.cpp).
@@ -44,7 +44,7 @@ bool read_plain(fhash_file& file, const Variable& variable, int64_t key, const L
 bool add_occupancy(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                    Buffer& mask, fhash_error& error);
 
-// Values of the profile paper, float64, between key frames and without the residual (paper.cpp).
+// Values of the profile paper, float64, between key frames (paper.cpp).
 bool read_network(fhash_file& file, const Variable& variable, double key, const Lattice& lattice,
                   const Buffer& requested, double* values, fhash_error& error);
 

@@ -121,7 +121,7 @@ def test_a_listing_is_for_one_screen() -> None:
     assert "not to be encoded: w0 (2,), w1 (2,)" in text
 
 
-PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
+PAPER = ["--profile=paper", "--tables=float16", "--epochs", "1", "--width", "4", "--quiet"]
 
 
 def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
@@ -154,6 +154,8 @@ def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: 
     wild = [
         "--profile",
         "paper",
+        "--tables",
+        "float16",
         "--epochs",
         "3",
         "--width",

@@ -19,6 +19,7 @@ from reference.kernels import encode_predicted
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.compact import encode as encode_module
 from fhash_codec.compact import predictor as choice
 from fhash_codec.compact import stages as planning
 from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling
@@ -34,6 +35,7 @@ from fhash_codec.compact.goal import (
     exchange,
     geometric_mean,
     goal_of,
+    held_psnr,
     missed_promise,
     promise,
     remarks,
@@ -42,7 +44,7 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import EFFORTS, Budget
 from fhash_codec.compact.plan import CodingPlan, holds_beside, plan, rank_share
 from fhash_codec.compact.predictor import IntegerTile, best_predictor, fit_weights
-from fhash_codec.compact.sample import Sample, mask_levels
+from fhash_codec.compact.sample import FEW_TILES, Sample, mask_levels
 from fhash_codec.compact.stages import (
     choose_tiles,
     coarser_bases,
@@ -62,7 +64,7 @@ from fhash_codec.features.selection import select_features
 from fhash_codec.measure.errors import MIN_SHARE
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, QualityError
 from fhash_formats.series import ArraySeries
 from fhash_formats.transform.predict import Predictor, passes_of
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
@@ -591,6 +593,20 @@ def figures(**others):
     return {**usual, "promised": {}, "quality": {"bulk": bulk}, "psnr_bulk": psnr_bulk, **others}
 
 
+def test_a_promise_of_a_network_holds_with_the_rounding_of_other_readers() -> None:
+    settings, promised = EncodeConfig(psnr=50.0, psnr_bulk=42.0), {"psnr": 50.0, "psnr_bulk": 42.0}
+
+    def told(psnr: float, psnr_bulk: float, rounding: float) -> str | None:
+        found = figures(promised=promised, psnr=psnr, psnr_bulk=psnr_bulk)
+        return missed_promise(settings, found, rounding)
+
+    assert told(50.1, 42.4, 3e-5) is None
+    assert "49.99 dB over the coreset in every reader" in (told(50.1, 42.4, 4e-5) or "")
+    # the bulk has a tenth of the range
+    assert "41.98 dB over the bulk in every reader" in (told(60.0, 42.2, 2e-5) or "")
+    assert held_psnr(None, 0.0) == np.inf
+
+
 @pytest.mark.parametrize(
     ("config", "kept", "missed", "text"),
     [
@@ -734,3 +750,28 @@ def test_a_fine_step_is_computed_in_float64_and_never_too_fine(step: float, doub
     assert chosen.quantum == 0.0
     assert chosen.step >= step
     assert 2.0 / chosen.step < 2.0**30
+
+
+def test_tiny_tiles_are_coded_few_times_where_their_bytes_cannot_be_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """600 tiles of 6 values: 30 trials on all of them took minutes for a file of 200 kB."""
+    values = (1e18 * (2 + np.sin(np.arange(450 * 6) * 0.01))).astype(np.uint64).reshape(450, 2, 3)
+    passes, samples = [], []
+    code_all, run = encode_module._code_all, Sample.run
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        passes.append(1)
+        return code_all(*arguments, **options)
+
+    def sampled(sample: Sample, *arguments: Any, **options: Any) -> Any:
+        samples.append(len(sample.tiles))
+        return run(sample, *arguments, **options)
+
+    monkeypatch.setattr(encode_module, "_code_all", counted)
+    monkeypatch.setattr(Sample, "run", sampled)
+    config = EncodeConfig(ratio=8, effort=2, tile="33x3x1x2")
+    with pytest.raises(QualityError, match="8 were asked for"):
+        fhash_codec.encode(values, tmp_path / "a.fhz", config)
+    assert len(passes) <= 4
+    assert max(samples) == FEW_TILES < 600

@@ -177,7 +177,7 @@ def test_every_group_is_measured(series: ArraySeries, tmp_path: Path) -> None:
         encode(series, path, EncodeConfig(effort=1, psnr=psnr))
         files.append(KeptFile(name=name, path=path, psnr=psnr))
     network = tmp_path / "network.fhz"
-    encode(series, network, EncodeConfig(profile="paper", epochs=1, width=4))
+    encode(series, network, EncodeConfig(profile="paper", tables="float16", epochs=1, width=4))
     files.append(KeptFile(name="network", path=network, psnr=20.0))
     made: list[Picture] = []
     allowance = Allowance(1000.0)

@@ -104,12 +104,12 @@ PROBE = PaperProbe(
 def test_each_step_and_each_point_of_the_curve_is_counted(
     epochs: int, points: int, steps: int
 ) -> None:
-    config = EncodeConfig(profile="paper", epochs=epochs)
+    config = EncodeConfig(profile="paper", tables="float16", epochs=epochs)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * steps + 0.25 * points
 
 
 def test_a_batch_of_another_size_makes_other_steps() -> None:
-    config = EncodeConfig(profile="paper", epochs=10, batch=10_000)
+    config = EncodeConfig(profile="paper", tables="float16", epochs=10, batch=10_000)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * 100 + 0.25 * 10
 
 
@@ -246,7 +246,7 @@ def test_of_a_long_series_a_part_is_read(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 SERIES_PREDICTION = ArraySeries(np.zeros((1, 2, 2, 2), np.float32))
-PAPER = EncodeConfig(profile="paper")
+PAPER = EncodeConfig(profile="paper", tables="float16")
 
 
 class _Known:
@@ -301,7 +301,7 @@ def test_the_most_epochs_that_fit_are_chosen(seconds: float, epochs: int, fits: 
 
 @pytest.mark.usefixtures("known")
 def test_epochs_that_are_given_are_the_most() -> None:
-    config = EncodeConfig(profile="paper", epochs=30)
+    config = EncodeConfig(profile="paper", tables="float16", epochs=30)
     assert choose(SERIES_PREDICTION, config, 10_000, capped=True).config.epochs == 30
 
 
@@ -732,7 +732,7 @@ def test_both_models_are_fitted_to_a_crop(monkeypatch: pytest.MonkeyPatch) -> No
     t, z, y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in (6, 12, 20, 20)), indexing="ij")
     series = ArraySeries((np.sin(x * y + t) * np.exp(-z)).astype(np.float32))
     monkeypatch.setattr(own, "CROP_VERTICES", 6 * 10**3)
-    asked = EncodeConfig(profile="auto", features=("interval:0.2:2",), max_error_rel=0.02, effort=2)
+    asked = EncodeConfig(profile="auto", features=("interval:0.2:2",), psnr=34.0, effort=2)
     choice = own.choose_model(series, asked)
     assert choice.crop.startswith("a crop")
     assert [price.profile for price in choice.prices] == ["compact", "paper"]
@@ -742,11 +742,11 @@ def test_both_models_are_fitted_to_a_crop(monkeypatch: pytest.MonkeyPatch) -> No
         assert min(price.seconds, price.region_ms, price.picture_ms) > 0
         assert 0 < (price.between or 0) < (price.psnr or 0)
     assert choice.config == asked.of_profile(choice.config.profile)
-    assert choice.config.max_error_rel == 0.02
+    assert choice.config.psnr == 34.0
     assert choice.to_dict()["chosen"] == choice.config.profile
     # the part has a smaller range, in which the same errors are a larger share
     whole, part = facts_of(series, silent), facts_of(cropped(series, 6000), silent)
-    moved = own._for_part(replace(asked, max_error_rel=None, psnr=60.0), whole, part)
+    moved = own._for_part(replace(asked, psnr=60.0), whole, part)
     assert moved.psnr == pytest.approx(60 - 20 * np.log10(whole.width / part.width))
 
 
@@ -754,7 +754,7 @@ def test_a_crop_without_the_feature_leaves_the_lattice(monkeypatch: pytest.Monke
     values = np.random.default_rng(0).random((12, 6, 7, 8), np.float32)
     values[11, 2, 3, 4] = 9.0
     monkeypatch.setattr(own, "CROP_VERTICES", 1000)
-    asked = EncodeConfig(profile="auto", features=("interval:5:10",), max_error=0.1)
+    asked = EncodeConfig(profile="auto", features=("interval:5:10",), psnr=20.0)
     choice = own.choose_model(ArraySeries(values), asked)
     assert (choice.config.profile, choice.prices) == ("compact", ())
     assert "no crop of the middle steps" in choice.why
@@ -762,6 +762,7 @@ def test_a_crop_without_the_feature_leaves_the_lattice(monkeypatch: pytest.Monke
     assert len(changing.prices) == 2
 
 
-def test_a_ratio_leaves_no_choice() -> None:
-    choice = own.choose_model(SERIES, EncodeConfig(profile="auto", ratio=20.0))
+@pytest.mark.parametrize("promise", [{"ratio": 20.0}, {"max_error": 0.1}, {"max_error_rel": 0.1}])
+def test_a_ratio_or_a_bound_leaves_no_choice(promise: dict[str, float]) -> None:
+    choice = own.choose_model(SERIES, EncodeConfig(profile="auto", **promise))
     assert (choice.config.profile, choice.prices) == ("compact", ())

@@ -256,7 +256,8 @@ def test_coded_tables_get_the_promise(tmp_path, monkeypatch, key_frames) -> None
     field = np.random.default_rng(0).random((3, 4, 5, 6), dtype=np.float32)
     with pytest.raises(Reached):
         fhash_codec.encode(field, tmp_path / "a.fhz", config)
-    assert [target.psnr for target in given] == [1.0]
+    (target,) = given  # with room for the rounding of other readers
+    assert 1.0 < target.psnr < 1.001
 
 
 @pytest.mark.parametrize(
@@ -285,6 +286,7 @@ def test_the_architecture_is_that_of_the_box_and_the_key_frames() -> None:
     field[:, 2:7, 3:8, 4:15] = 1.0
     config = EncodeConfig(
         profile="paper",
+        tables="float16",
         features=("interval:0.5:2",),
         dilation=0,
         key_frames="every:2",
@@ -301,7 +303,7 @@ def test_the_architecture_is_that_of_the_box_and_the_key_frames() -> None:
     assert (architecture.embedding_size, architecture.width) == (3, 8)
 
 
-QUICK = EncodeConfig(profile="paper", epochs=6, width=16)
+QUICK = EncodeConfig(profile="paper", tables="float16", epochs=6, width=16)
 
 
 def decoded(path) -> np.ndarray:
@@ -347,21 +349,21 @@ def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None
 
 
 def test_the_same_input_gives_the_same_bytes_without_timings(field, tmp_path) -> None:
-    config = EncodeConfig(profile="paper", epochs=3, width=16, timings=False)
+    config = EncodeConfig(profile="paper", tables="float16", epochs=3, width=16, timings=False)
     for name in ("a.fhz", "b.fhz"):
         fhash_codec.encode(field(), tmp_path / name, config)
     assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
     fhash_codec.encode(
         field(),
         tmp_path / "c.fhz",
-        EncodeConfig(profile="paper", epochs=3, width=16, timings=False, seed=1),
+        EncodeConfig(profile="paper", tables="float16", epochs=3, width=16, timings=False, seed=1),
     )
     assert (tmp_path / "a.fhz").read_bytes() != (tmp_path / "c.fhz").read_bytes()
 
 
 @pytest.mark.parametrize("moment", [1, 30, 48])
 def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(field, tmp_path, moment) -> None:
-    config = EncodeConfig(profile="paper", epochs=3, width=16, timings=False)
+    config = EncodeConfig(profile="paper", tables="float16", epochs=3, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     path = tmp_path / "run.fhz"
 
@@ -467,6 +469,7 @@ def test_values_between_key_frames_are_right_where_one_of_them_has_no_coreset(tm
     for samples in ("keys", "published"):
         config = EncodeConfig(
             profile="paper",
+            tables="float16",
             features=("interval:0.75:1",),
             key_frames="0,4",
             epochs=40,

@@ -303,14 +303,14 @@ def test_a_promise_is_kept_and_no_more(rough_waves, coded_config, tmp_path, belo
 
 
 def test_a_promise_out_of_reach_costs_no_bytes(waves, coded_config, tmp_path) -> None:
-    config = replace(coded_config, epochs=2)
+    config = replace(coded_config, epochs=0)
     free = fhash_codec.encode(waves(), tmp_path / "a.fhz", config)
     with (
         pytest.warns(FhashWarning, match="ends at its limit of 0 more seconds: the model has"),
-        pytest.raises(QualityError, match="150 dB were asked for") as missed,
+        pytest.raises(QualityError, match="85 dB were asked for") as missed,
     ):
         fhash_codec.encode(
-            waves(), tmp_path / "b.fhz", replace(config, psnr=150.0, train_on_seconds=0)
+            waves(), tmp_path / "b.fhz", replace(config, psnr=85.0, train_on_seconds=0)
         )
     assert "Training ended at its limit of --train-on-seconds 0: more may help" in str(missed.value)
     assert missed.value.figures["tables_loss_db"] <= MAX_LOSS + 1e-4
@@ -318,13 +318,20 @@ def test_a_promise_out_of_reach_costs_no_bytes(waves, coded_config, tmp_path) ->
 
 
 def test_training_goes_on_for_a_promise(rough_waves, coded_config, tmp_path) -> None:
-    config = replace(coded_config, epochs=10)
+    config = replace(coded_config, epochs=0)
     free = fhash_codec.encode(rough_waves, tmp_path / "a.fhz", config)
     wanted = free["psnr"] + 1.0
     figures = fhash_codec.encode(rough_waves, tmp_path / "b.fhz", replace(config, psnr=wanted))
     assert wanted <= figures["psnr"] < wanted + 0.1
-    with fhash_codec.open(tmp_path / "b.fhz") as volume:
-        assert volume.info["training"]["epochs"] > 10
+    assert figures["epochs"] > free["epochs"]
+
+
+def test_epochs_asked_for_are_trained_and_no_more(waves, tmp_path) -> None:
+    config = EncodeConfig(profile="paper", epochs=1, width=4)
+    with pytest.raises(QualityError, match=r"50 dB .*--epochs 1 ended the training") as missed:
+        fhash_codec.encode(waves(), tmp_path / "a.fhz", config)
+    assert missed.value.figures["epochs"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.missed.fhz"]
 
 
 def test_other_readers_see_what_is_needed(pair) -> None:
@@ -579,6 +586,7 @@ def test_needed_are_the_corners_around_samples(box, keys, fold, fringe) -> None:
 
 FEATURE = EncodeConfig(
     profile="paper",
+    tables="float16",
     epochs=2,
     width=8,
     features=("interval:80:120",),

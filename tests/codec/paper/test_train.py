@@ -74,16 +74,22 @@ def test_going_on_from_a_checkpoint_ends_at_the_same_bits(setup, coreset, tmp_pa
 
 def test_a_checkpoint_belongs_to_its_coreset_and_settings(coreset, other_coreset, tmp_path) -> None:
     output = tmp_path / "run.fhz"
-    one = checkpoint_path(output, coreset, EncodeConfig(profile="paper"))
+    one = checkpoint_path(output, coreset, EncodeConfig(profile="paper", tables="float16"))
     assert one.parent == tmp_path
     assert one == checkpoint_path(
         output, coreset, EncodeConfig(profile="paper", psnr=50.0, tables="float32", timings=False)
     )
-    assert one == checkpoint_path(output, coreset, EncodeConfig(profile="paper", device="cpu"))
-    other_bits = EncodeConfig(profile="paper", deterministic=True)
+    assert one == checkpoint_path(
+        output, coreset, EncodeConfig(profile="paper", tables="float16", device="cpu")
+    )
+    other_bits = EncodeConfig(profile="paper", tables="float16", deterministic=True)
     assert one != checkpoint_path(output, coreset, other_bits)
-    assert one != checkpoint_path(output, coreset, EncodeConfig(profile="paper", epochs=3))
-    assert one != checkpoint_path(output, other_coreset, EncodeConfig(profile="paper"))
+    assert one != checkpoint_path(
+        output, coreset, EncodeConfig(profile="paper", tables="float16", epochs=3)
+    )
+    assert one != checkpoint_path(
+        output, other_coreset, EncodeConfig(profile="paper", tables="float16")
+    )
 
 
 def test_a_damaged_checkpoint_is_named_not_ignored(tmp_path) -> None:
@@ -226,7 +232,7 @@ def test_a_network_that_died_of_its_rate_is_no_result(setup, coreset, rate, says
         assert train(engine, plan, coreset, TrainingProgress())
 
 
-CONFIG = EncodeConfig(profile="paper", epochs=1, width=8, batch=20_000)
+CONFIG = EncodeConfig(profile="paper", tables="float16", epochs=1, width=8, batch=20_000)
 
 
 @pytest.fixture
@@ -304,10 +310,18 @@ def test_a_round_has_rates_of_its_own(setup, coreset) -> None:
     assert (extended(plan, 3, "constant").rates[len(plan.rates) :] == 0.5 * plan.rates[0]).all()
 
 
-def test_a_training_goes_on_to_its_goal(coreset, tmp_path) -> None:
-    config = EncodeConfig(profile="paper", epochs=5, width=16)
+def test_a_training_goes_on_to_its_goal_but_for_epochs_asked_for(
+    coreset, tmp_path, monkeypatch
+) -> None:
+    config = EncodeConfig(profile="paper", tables="float16", epochs=5, width=16)
     architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
     first = train_model(coreset, architecture, config, tmp_path / "a.fhz")
+    goal = Goal(psnr=300.0, promised=300.0, seconds=1e6)
+    exactly = train_model(coreset, architecture, config, tmp_path / "a.fhz", goal=goal)
+    assert exactly.epochs == 5
+    config = replace(config, epochs=0)
+    for module in ("train", "fit"):
+        monkeypatch.setattr(f"fhash_codec.paper.{module}.usual_epochs", lambda _: 5)
     psnr = first.history[-1]["psnr"]
     assert psnr is not None
     goal = Goal(psnr=psnr + 2.0, promised=psnr + 1.5, seconds=1e6)
@@ -322,7 +336,7 @@ def test_a_training_goes_on_to_its_goal(coreset, tmp_path) -> None:
 
 
 CONFIG_FIT_ON_CUDA = EncodeConfig(
-    profile="paper", epochs=2, width=8, batch=20_000, device="cuda", engine="slab"
+    profile="paper", tables="float16", epochs=2, width=8, batch=20_000, device="cuda", engine="slab"
 )
 
 

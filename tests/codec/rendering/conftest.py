@@ -36,7 +36,9 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 CONFIGS = {
     "compact": EncodeConfig(effort=1),
     "feature": EncodeConfig(effort=1, features=("interval:3:99",), dilation=0),
-    "paper": EncodeConfig(profile="paper", features=("interval:3:99",), epochs=15, width=16),
+    "paper": EncodeConfig(
+        profile="paper", tables="float16", features=("interval:3:99",), epochs=15, width=16
+    ),
 }
 
 

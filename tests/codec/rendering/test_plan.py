@@ -249,7 +249,9 @@ def test_auto_is_arm_on_a_cpu_where_all_samples_cost_less_than_the_frame(
     monkeypatch.setattr(f"{module}.arrays_on", lambda device: NUMPY)
     path = tmp_path / "a.fhz"
     field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
-    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
+    fhash_codec.encode(
+        field, path, EncodeConfig(profile="paper", tables="float16", epochs=1, width=4)
+    )
     samples = 16 * 16 * np.sqrt(4**2 + 5**2 + 6**2) / 0.5
     limit = 4 * 5 * 6 / samples
     monkeypatch.setattr(f"{module}.VERTICES_A_SAMPLE", limit * (0.999 if few else 1.001))
@@ -555,7 +557,9 @@ def test_every_level_draws_uneven_axes_alike(tmp_path: Path) -> None:
 def test_a_network_is_sampled_where_uneven_axes_say(tmp_path: Path) -> None:
     axis, even = UNEVEN[::3], EVEN[::3]
     values = np.repeat(ball(even, even, axis)[None], 2, axis=0)
-    config = EncodeConfig(profile="paper", features=("interval:0.3:2",), epochs=8, width=8)
+    config = EncodeConfig(
+        profile="paper", tables="float16", features=("interval:0.3:2",), epochs=8, width=8
+    )
     path = written(tmp_path / "p.fhz", values, config, z=even, y=even, x=axis)
     scene = {"size": [12, 12], "transfer_function": LINEAR, "effects": {"shading": True}}
     cache, arm, stream = (

@@ -7,6 +7,7 @@ import itertools
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from PIL import Image as Pictures
 from rarely import rarely
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume
+from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering import render
 from fhash_codec.rendering import renderer as module
@@ -62,7 +63,8 @@ def test_without_a_scene_the_default_is_rendered(volume: Volume) -> None:
     stages = []
     image = render(volume, progress=lambda stage, *_: stages.append(stage))
     assert image.rgba.shape == (*Scene().size[::-1], 4)
-    assert dict(image.scene) == Scene().to_dict()
+    step = image.scene["step"]
+    assert dict(image.scene) == Scene(step=step).to_dict()
     assert set(stages) == {"decoding", "marching"}
 
 
@@ -86,6 +88,36 @@ def test_importing_the_package_loads_no_renderer() -> None:
     )
     command = [sys.executable, "-c", code]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("profile", ["compact", "network"])
+@pytest.mark.parametrize(
+    ("full", "chosen"), [((), 0), ((2,), 2), ((4, 6), 4), ((1, 3), 0), (range(9), 0)]
+)
+def test_the_default_step_is_that_of_most_structure_of_five(
+    tmp_path: Path, full: Sequence[int], chosen: int, profile: str
+) -> None:
+    """Steps 0, 2, 4, 6 and 8 are looked at; equal ones give the earliest."""
+    values = np.zeros((9, 6, 7, 8), np.float32)
+    for step in full:
+        values[step, 2:4, 2:5, 3:6] = 1
+    values[0, 0, 0, 0] = 4  # the range of the series, and hardly a sight
+    network = {"profile": "network", "tables": "float32", "epochs": 60}
+    settings = EncodeConfig(max_error=0.01) if profile == "compact" else EncodeConfig(**network)
+    fhash_codec.encode(values, tmp_path / "run.fhz", settings)
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        plan = Renderer(volume).plan(Scene(size=(20, 20)))
+        assert plan.step == plan.scene.step
+        assert plan.step == chosen or (profile == "network" and not full)
+        surface = {"effects": {"isosurfaces": [{"value": 0.5}]}}
+        surfaces = Scene.from_dict({**surface, "transfer_function": {"nothing": True}})
+        assert Renderer(volume).plan(surfaces).step == chosen or not full
+
+
+def test_the_step_that_is_asked_for_is_taken(volume: Volume) -> None:
+    renderer = Renderer(volume)
+    for moment in ({"step": 0.0}, {"step": 1.5}, {"time": 0.0}):
+        assert renderer.plan(Scene.from_dict(moment)).scene == Scene.from_dict(moment)
 
 
 def scene(**parts: Any) -> Scene:
@@ -116,10 +148,10 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def test_what_was_decoded_is_kept(renderer: Renderer, decoded: list[float]) -> None:
-    first = renderer.render(scene())
-    renderer.render(scene(camera={"azimuth": 40}))
+    first = renderer.render(scene(step=0))
+    renderer.render(scene(step=0, camera={"azimuth": 40}))
     renderer.render(scene(step=2))
-    last = renderer.render(scene())
+    last = renderer.render(scene(step=0))
     assert decoded == [0, 2]
     np.testing.assert_array_equal(first.rgba, last.rgba)
 
@@ -174,7 +206,7 @@ def test_what_does_not_fit_is_not_kept(volume: Volume, decoded: list[float]) -> 
     decoded.clear()
     none = Renderer(volume, memory=10)
     for _ in range(2):
-        assert none.render(scene()).rgba[..., 3].any()
+        assert none.render(scene(step=0)).rgba[..., 3].any()
     assert decoded == [0, 0]
 
 
@@ -270,7 +302,7 @@ def test_nothing_outside_a_clip_is_decoded_or_evaluated(
     clip = {"z": [9, 10], "planes": [{"normal": [1, 0, 0], "offset": 5}]}
     march = {"mode": mode, "lod": 0}
     fog = {"opacity": "linear", "density": 0.05}
-    values = {"size": [30, 30], "march": march, "transfer_function": fog}
+    values = {"size": [30, 30], "step": 0, "march": march, "transfer_function": fog}
     with fhash_codec.open(files[kind]) as volume:
         whole = Renderer(volume).render(Scene.from_dict(values))
         regions.clear()

@@ -21,7 +21,7 @@ CASE = Case(
     make=lambda: series(waves().astype(np.float32)),
     settings={"bound": EncodeConfig(max_error_rel=0.01, effort=1, timings=False)},
 )
-PAPER = EncodeConfig(profile="paper", width=4, epochs=2, timings=False)
+PAPER = EncodeConfig(profile="paper", tables="float16", width=4, epochs=2, timings=False)
 
 
 @pytest.fixture(scope="session")

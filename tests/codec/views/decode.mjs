@@ -1,6 +1,7 @@
 // Digests of the values that fhash.wasm reads of containers: node decode.mjs FHASH.wasm PRIORS RUN.fhz...
+// With --values in place of the first container: the values of all steps of the next, float64.
 import { createHash } from "node:crypto";
-import { readFileSync } from "node:fs";
+import { readFileSync, writeSync } from "node:fs";
 import { join } from "node:path";
 
 const [wasm, priors, ...runs] = process.argv.slice(2);
@@ -31,14 +32,16 @@ function call(status) {
   if (status) throw new Error(new TextDecoder().decode(bytes.subarray(error + 4, bytes.indexOf(0, error + 4))));
 }
 
-/** Digest of a step of a variable at a level of detail, as float64 with one kind of NaN. */
-function digest(file, number, step, lod, shape) {
+/** A step of a variable at a level of detail, as float64 with one kind of NaN. */
+function read(file, number, step, lod, shape) {
   const count = shape.slice(1).reduce((product, n) => product * Math.ceil(n / 2 ** lod), 1), at = library.malloc(8 * count);
   call(library.fhash_read(file, number, step, 0, lod, 11, at, error));
   const values = new Float64Array(library.memory.buffer, at, count).map((one) => (Number.isNaN(one) ? NaN : one));
   library.free(at);
-  return createHash("sha256").update(values).digest("hex");
+  return values;
 }
+
+const whole = runs[0] === "--values" && runs.shift();
 
 const found = {};
 for (const run of runs) {
@@ -50,11 +53,12 @@ for (const run of runs) {
     view().setUint32(place, 176, true);
     call(library.fhash_variable_get(file, number, place, error));
     const levels = view().getInt32(place + 20, true), shape = [0, 1, 2, 3].map((n) => Number(view().getBigInt64(place + 24 + 8 * n, true)));
-    for (const step of new Set([0, shape[0] - 1, (shape[0] - 1) / 2])) {
-      for (const lod of new Set([0, Math.min(levels, 1)])) each.push([number, step, lod, digest(file, number, step, lod, shape)]);
+    if (whole) for (let step = 0; step < shape[0]; step++) writeSync(1, read(file, number, step, 0, shape));
+    else for (const step of new Set([0, shape[0] - 1, (shape[0] - 1) / 2])) {
+      for (const lod of new Set([0, Math.min(levels, 1)])) each.push([number, step, lod, createHash("sha256").update(read(file, number, step, lod, shape)).digest("hex")]);
     }
   }
   library.fhash_close(file);
   library.fhash_context_destroy(context);
 }
-console.log(JSON.stringify(found));
+if (!whole) console.log(JSON.stringify(found));

@@ -29,12 +29,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
+from rounding import rounding
 
 import fhash_codec
 from fhash_cli.main import program
 from fhash_codec import EncodeConfig
+from fhash_codec.native import network
 from fhash_codec.rendering.colours import COLOUR_MAPS
-from fhash_codec.rendering.renderer import Renderer
+from fhash_codec.rendering.renderer import Renderer, structure
 from fhash_codec.rendering.scenes import SCENE_KEY, Scene, scene_in_png, text_in_png
 from fhash_codec.views.page import FOLDER, PRIORS, WIDGET, Page, embedded
 from fhash_codec.views.server import Server
@@ -305,6 +307,51 @@ def test_decoder_gives_the_bits_of_the_library() -> None:
                 )
                 compared += 1
     assert compared > 100
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="there is no node")
+@pytest.mark.parametrize(("psnr", "width", "scale"), [(50.0, 0, 1.0), (80.0, 32, 1e3)])
+def test_a_network_keeps_its_promise_in_every_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, psnr: float, width: int, scale: float
+) -> None:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in (3, 8, 9, 10)), indexing="ij")
+    values = scale * (np.sin(2 * x + t) * np.cos(y - 0.3 * t) + 0.1 * z * t)
+    run = tmp_path / "run.fhz"
+    fhash_codec.encode(values, run, EncodeConfig(profile="network", psnr=psnr, width=width))
+    readers: dict[str, np.ndarray] = {}
+    with fhash_codec.open(run) as volume:
+        most = rounding(volume)
+        for path in network.machine_paths():
+            monkeypatch.setattr(network, "best_path", lambda _, bit=network.PATHS[path]: bit)
+            readers[path] = volume.read_steps(range(3))
+    library = native.library()
+    readers["libfhash"] = np.stack([read_natively(library, run, 0, t, 0)[0] for t in range(3)])
+    words = ["node", Path(__file__).with_name("decode.mjs"), WASM, FOLDER, "--values", run]
+    page = subprocess.run(words, capture_output=True, check=True).stdout
+    readers["page"] = np.frombuffer(page).reshape(values.shape)
+    for name, decoded in readers.items():
+        error = np.sqrt(np.mean((decoded - values) ** 2)) / np.ptp(values)
+        assert -20 * np.log10(error) >= psnr, name
+        assert np.abs(decoded - readers["libfhash"]).max() <= most
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="there is no node")
+def test_the_page_chooses_the_step_of_render(steady: Path) -> None:
+    surface = {"value": 20.0, "opacity": 0.5}
+    scene = Scene.from_dict({"step": 0, "effects": {"isosurfaces": [surface]}})
+    with fhash_codec.open(steady) as volume:
+        plan = Renderer(volume).plan(scene)
+        frames = [volume.read_lod(step, 0) for step in (0, 3)]
+    job = {
+        "frames": [frame.ravel().tolist() for frame in frames],
+        "shape": frames[0].shape,
+        "points": plan.function.points.tolist(),
+        "positions": plan.function.colours.positions.tolist(),
+        "surfaces": [surface],
+    }
+    words = ["node", Path(__file__).with_name("structure.mjs"), FOLDER]
+    done = subprocess.run(words, input=json.dumps(job), capture_output=True, text=True, check=True)
+    np.testing.assert_allclose(json.loads(done.stdout), [structure(each, plan) for each in frames])
 
 
 def read_natively(

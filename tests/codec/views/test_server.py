@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -119,6 +120,62 @@ def test_every_key_has_the_bytes_of_the_view(feature: Path) -> None:
         absent = "/density/c/0/0/0/0"
         assert view.size(absent[1:]) is None
         assert ask(absent)[0] == 404
+
+
+def raw(server: Server, request: bytes) -> tuple[bytes, dict[str, str], bytes]:
+    """Status line, headers, and all that follows, of bytes sent over one connection."""
+    with socket.create_connection(server.server_address[:2], timeout=30) as connection:
+        connection.sendall(request)
+        connection.shutdown(socket.SHUT_WR)
+        head, _, rest = b"".join(iter(partial(connection.recv, 1 << 16), b"")).partition(
+            b"\r\n\r\n"
+        )
+    status, *lines = head.split(b"\r\n")
+    return status, dict(line.decode().split(": ", 1) for line in lines), rest
+
+
+HOST = b" HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+SMUGGLED = b"GET /zarr.json" + HOST + b"\r\n"
+GOOD = "https://good.example"
+REQUESTS = {
+    "a key": (b"GET /zarr.json" + HOST, b"200"),
+    "HEAD": (b"HEAD /zarr.json" + HOST, b"200"),
+    "OPTIONS": (b"OPTIONS /zarr.json" + HOST, b"204"),
+    "of an allowed page": (b"GET /zarr.json" + HOST + f"Origin: {GOOD}\r\n".encode(), b"200"),
+    "kept": (b"GET /zarr.json" + HOST + b"If-None-Match: *\r\n", b"304"),
+    "unknown": (b"GET /nothing" + HOST, b"404"),
+    "another name": (b"GET / HTTP/1.1\r\nHost: evil.example\r\n", b"421"),
+    "two names": (b"GET /" + HOST + b"Host: evil.example\r\n", b"400"),
+    "no HTTP": (b"\0<script>\r\n", b"400"),
+    "another version": (b"GET /zarr.json HTTP/1.x\r\n", b"400"),
+    "no version": (b"GET /zarr.json\r\n", b"505"),
+    "PUT": (b"PUT /zarr.json" + HOST, b"405"),
+    "a range beyond": (b"GET /zarr.json" + HOST + b"Range: bytes=999999-\r\n", b"416"),
+    "no body": (b"GET /zarr.json" + HOST + b"Content-Length: 0\r\n", b"200"),
+    "a body": (b"GET /nothing" + HOST + b"Content-Length: 43\r\n", b"400"),
+    "a body of HEAD": (b"HEAD /nothing" + HOST + b"Content-Length: 43\r\n", b"400"),
+    "two lengths": (
+        b"GET /nothing" + HOST + b"Content-Length: 0\r\nContent-Length: 43\r\n",
+        b"400",
+    ),
+    "a chunked body": (b"GET /nothing" + HOST + b"Transfer-Encoding: chunked\r\n", b"400"),
+}
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_every_answer_is_guarded_and_a_body_is_no_request(whole: Path, name: str) -> None:
+    request, code = REQUESTS[name]
+    bodied = name.startswith(("a body", "two lengths", "a chunked"))
+    with serving(whole, origins=[GOOD]) as server:
+        status, headers, rest = raw(server, request + b"\r\n" + (SMUGGLED if bodied else b""))
+    assert status.split()[1] == code
+    assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    whose = "cross-origin" if "allowed" in name else "same-origin"
+    assert headers["Cross-Origin-Resource-Policy"] == whose
+    if bodied:
+        assert headers["Connection"] == "close"
+        assert b"HTTP/1.1" not in rest
 
 
 def test_ranges_server(ask: Ask) -> None:

@@ -414,7 +414,6 @@ def test_a_table_that_overflows_the_type_of_decoded_values_is_refused(samples) -
     ("path", "value"),
     [
         ("required_features", []),
-        ("required_features", ["transform", "residual"]),
         ("model.levels", [[4, 3, 4, 6], [2, 2, 2, 3]]),
         ("model.levels", [[5, 3, 4, 6]]),
         ("model.levels", [[4, 3, 4, 5]]),

@@ -469,11 +469,7 @@ bool check_network(const Variable& variable, fhash_error& error) {
                 return false;
         }
     }
-    if (!variable.residual) return true;
-    return check_array(variable, "residual",
-                       {variable.shape[0], variable.length(0), variable.length(1),
-                        variable.length(2)},
-                       {FHASH_FLOAT32, FHASH_FLOAT64}, true, error);
+    return true;
 }
 
 bool read_network(fhash_file& file, const Variable& variable, double key, const Lattice& lattice,

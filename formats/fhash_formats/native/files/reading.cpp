@@ -227,7 +227,7 @@ bool read_compact(const Call& call, int64_t key, Frame& frame, fhash_error& erro
     return read && check_finite(frame, error);
 }
 
-// Values of the profile paper, float64, with its residual.
+// Values of the profile paper, float64.
 bool read_paper(const Call& call, double key, Frame& frame, fhash_error& error) {
     const Variable& variable = call.variable;
     const size_t count = size_t(call.common.size());
@@ -238,20 +238,7 @@ bool read_paper(const Call& call, double key, Frame& frame, fhash_error& error) 
     double* const values = reinterpret_cast<double*>(frame.values.data());
     for (int64_t each : {int64_t(std::floor(key)), int64_t(std::ceil(key))})
         if (!add_occupancy(call.file, variable, each, call.common, frame.mask, error)) return false;
-    if (!read_network(call.file, variable, key, call.common, frame.mask, values, error))
-        return false;
-    if (!variable.residual) return true;
-    const Array* const array = variable.find("residual");
-    const double before = std::floor(call.step), weight = call.step - before;
-    Frame frames[2];
-    for (int i = 0; i < (weight > 0 ? 2 : 1); i++)
-        if (!read_table(call.file, *array, int64_t(before) + i, call.common, frames[i], error) ||
-            !check_finite(frames[i], error))
-            return false;
-    std::vector<double> more;
-    to_floats<double>(call, frames[0], frames[1], weight, false, more);
-    for (size_t i = 0; i < count; i++) values[i] += more[i];
-    return true;
+    return read_network(call.file, variable, key, call.common, frame.mask, values, error);
 }
 
 bool read_values(Call& call, fhash_error& error) {
@@ -277,7 +264,7 @@ bool read_values(Call& call, fhash_error& error) {
     }
     if (!take_missing(call, first.mask, error)) return false;
     if (call.integers()) return give_integers(call, &first, error);
-    const bool clipped = key != before || variable.residual;
+    const bool clipped = key != before;
     return variable.in_float32() ? give_floats<float>(call, first, second, weight, clipped, error)
                                  : give_floats<double>(call, first, second, weight, clipped, error);
 }

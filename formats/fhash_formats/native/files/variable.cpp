@@ -13,7 +13,7 @@ namespace {
 constexpr int64_t MAX_RULED = 1 << 20;  // positions that a header describes
 constexpr int64_t ULPS_LIMIT = (int64_t(1) << 52) - 1;
 const char* const AXES[4] = {"time", "z", "y", "x"};
-const char* const FEATURES[4] = {"transform", "plain", "sparse-tables", "residual"};
+const char* const FEATURES[3] = {"transform", "plain", "sparse-tables"};
 
 bool is_node(const std::string& name) {
     const auto fits = [](char letter) {
@@ -156,13 +156,12 @@ bool read_model(Variable& variable, fhash_error& error) {
         return false;
     variable.compact = profile == "compact";
     variable.plain = has_feature(variable.top, "plain");
-    variable.residual = has_feature(variable.top, "residual");
     if (!variable.compact && profile != "paper")
         return fail(error, FHASH_ERROR_UNSUPPORTED, "header key model.profile is %s",
                     shown(profile.c_str()).c_str());
     const bool coded = variable.tables == "transform";
     const bool transform = has_feature(variable.top, "transform");
-    const bool sound = variable.compact ? !variable.residual && (variable.plain || transform)
+    const bool sound = variable.compact ? variable.plain || transform
                                         : !variable.plain && (!coded || transform);
     if (!variable.top.need(sound, "required_features", "those of its profile", error) ||
         !read_levels(variable, error))
