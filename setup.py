@@ -245,7 +245,11 @@ class BuildWasm(Command):
         build = Path("build/wasm")
         build.mkdir(parents=True, exist_ok=True)
         every = sorted([*FORMATS.rglob("*.cpp"), *FORMATS.rglob("*.c")])
-        others = ("hdf5_filter.cpp", "functions.cpp", *(path.name for path in FORMATS.glob("files/*.cpp")))
+        others = (
+            "hdf5_filter.cpp",
+            "functions.cpp",
+            *(path.name for path in FORMATS.glob("files/*.cpp")),
+        )
         sources = [source for source in every if source.name not in others]
         headers = max(path.stat().st_mtime for path in [*FORMATS.rglob("*.h*"), Path(__file__)])
 

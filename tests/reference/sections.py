@@ -32,6 +32,7 @@ from reference.kernels import (
     single_band,
 )
 
+
 def build_stream(
     kind: int,
     settings: TileSettings | None,

@@ -426,7 +426,7 @@ def test_missing_values_that_are_none_are_refused() -> None:
             TransformCodec(max_error=1, missing=given)  # type: ignore[arg-type]
         with pytest.raises(InputError, match="a list of at most 16 numbers"):
             NumcodecsTransform(max_error=1, missing=given)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="has 0.5, which is no int16"):
+    with pytest.raises(InputError, match=r"has 0\.5, which is no int16"):
         NumcodecsTransform(max_error=1, missing=[0.5]).encode(np.zeros((3, 4), "i2"))
 
 
