@@ -223,7 +223,7 @@ def test_a_picture_without_ink_says_so_and_the_step_is_told(fhash: Fhash, tmp_pa
     assert (drawn.exit_code, drawn.stderr) == (0, "")
     assert "1, t = 1, of five steps the one of most structure" in drawn.stdout
     first = fhash("render", tmp_path / "box.fhz", *words, "-q", "--t", "0", "--effect", "box")
-    assert "at step 0: another --t" in first.stderr
+    assert "at step 0: another step" in first.stderr
     assert "five steps" not in first.stdout
 
 
