@@ -728,8 +728,8 @@ def command(
                     " leave them out of an animation or evolution"
                 )
             draw = _draw_evolution if several.animate is None else _animate
-            drawn = draw(volume, scene, several, str(path), force=picture.force, progress=progress)
-            emit(*drawn, as_json)
+            found = draw(volume, scene, several, str(path), force=picture.force, progress=progress)
+            emit(found[0], found[1], as_json)
             return
         scene = tracking(volume, scene, several, progress)
         _check_outputs(path, picture, scene, run)
