@@ -6,7 +6,6 @@ import dataclasses
 import math
 import os
 import time
-import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -30,7 +29,7 @@ from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField
 from fhash_codec.rendering.stream_march import stream
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_codec.volume import Volume, only_features
-from fhash_formats.errors import FhashError, FhashWarning, InputError
+from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.files import file_name, without_secrets
 
 GAP = 1 / 64
@@ -461,17 +460,15 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
     return replace(plan.task, light=light), light.secondary_rays
 
 
-def warn_where_faint(image: Image, plan: Plan, volume: Volume) -> None:
-    """Warn with FhashWarning where a picture has hardly any ink."""
+def faint_text(image: Image, plan: Plan, volume: Volume) -> str:
+    """Text on a picture that has hardly any ink; empty for others."""
     if image.ink >= FAINT:
-        return
+        return ""
     low, high = volume.value_range.low, volume.value_range.high
     why = "another step, opacity or zoom may show more" if low < high else f"all values are {low:g}"
-    warnings.warn(
+    return (
         f"{image.ink:.2%} of the picture's pixels differ from the background at step "
-        f"{plan.step:g}: {why}",
-        FhashWarning,
-        stacklevel=2,
+        f"{plan.step:g}: {why}"
     )
 
 

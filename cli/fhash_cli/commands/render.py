@@ -29,7 +29,7 @@ from fhash_cli.options import (
     run_argument,
     variable_option,
 )
-from fhash_cli.output import Progress, emit, extent, number, table
+from fhash_cli.output import Progress, emit, extent, number, say, table
 from fhash_cli.selection import steps_of, time_of
 from fhash_formats.errors import InputError, suggestion
 from fhash_formats.support.files import file_name
@@ -713,7 +713,7 @@ def command(
     is. With --animate the output is NAME.png for numbered pictures, of which only missing ones are
     drawn, or a film NAME.mp4 or NAME.gif.
     """
-    from fhash_codec.rendering.renderer import Renderer, warn_where_faint
+    from fhash_codec.rendering.renderer import Renderer, faint_text
     from fhash_codec.times import is_static, time_text
     from fhash_codec.volume import open as open_volume
 
@@ -729,8 +729,7 @@ def command(
                 )
             draw = _draw_evolution if several.animate is None else _animate
             found = draw(volume, scene, several, str(path), force=picture.force, progress=progress)
-            emit(found[0], found[1], as_json)
-            return
+            return emit(found[0], found[1], as_json)
         scene = tracking(volume, scene, several, progress)
         _check_outputs(path, picture, scene, run)
         renderer = Renderer(volume)
@@ -739,7 +738,8 @@ def command(
         times = volume.coords["t"]
         time = "" if is_static(times) else f"{plan.step:g}, t = {time_text(times, plan.time)}"
         time += "" if plan.scene == scene else ", of five steps the one of most structure"
-        warn_where_faint(image, plan, volume)
+        if faint := faint_text(image, plan, volume):
+            say(faint)
     paths = [str(written) for written in _save(image, path, picture)]
     result: Rendered = {
         "paths": paths,

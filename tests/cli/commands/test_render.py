@@ -208,7 +208,6 @@ def test_one_line_and_nothing_written(
     assert part in line
 
 
-@pytest.mark.filterwarnings("default")
 def test_a_picture_without_ink_says_so_and_the_step_is_told(fhash: Fhash, tmp_path: Path) -> None:
     values = np.full((3, 10, 10, 10), 3, np.float32)
     fhash_codec.encode(values, tmp_path / "flat.fhz", fhash_codec.EncodeConfig(effort=1))
@@ -227,7 +226,6 @@ def test_a_picture_without_ink_says_so_and_the_step_is_told(fhash: Fhash, tmp_pa
     assert "five steps" not in first.stdout
 
 
-@pytest.mark.filterwarnings("ignore:.* of the picture's pixels")
 def test_a_picture_is_replayed_and_changed(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     first, again, scene, changed = (
         tmp_path / name for name in ("a.png", "b.png", "s.json", "c.png")
