@@ -63,8 +63,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     np.save(folder / "data.npy", (1 / (1 + np.exp(-2 * front))).astype(np.float32))
     commands = {
         "encode": "encode data.npy -o run.fhz --json",
-        "paper": "encode data.npy -o network.fhz --profile paper --tables float16 --epochs 2"
-        " --width 4",
+        "paper": "encode data.npy -o network.fhz --profile=paper --tables=dense --epochs=2",
         "decode": "decode run.fhz --t 1 -o step.npy",
         "render": "render run.fhz -o step.png --size 64x64",
         "stream": "render network.fhz -o stream.png --size 16x16 --march stream",

@@ -387,11 +387,9 @@ class Target:
 
     Attributes:
         psnr: promised PSNR in dB over the samples, if any.
-        loss: dB that coding may cost where no PSNR is promised, or the tables do not have it.
     """
 
     psnr: float | None
-    loss: float = MAX_LOSS
 
     def allowed(self, exact_error: float) -> tuple[float, float]:
         """Return the mean squared error that decoded samples may have, and the search's width.
@@ -404,7 +402,7 @@ class Target:
         promised = 0.0 if self.psnr is None else 10 ** (-(self.psnr + SAFE) / 10)
         if promised > exact_error:
             return promised, PROMISE_WIDTH
-        return max(exact_error * 10 ** (self.loss / 10), MIN_TABLES_ERROR), LOSS_WIDTH
+        return max(exact_error * 10 ** (MAX_LOSS / 10), MIN_TABLES_ERROR), LOSS_WIDTH
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -155,6 +155,8 @@ BINS = 512
 """Bins of the histogram of a series."""
 COARSE = 2**18
 """Most vertices of a frame that is read for the histogram, where levels of detail allow it."""
+FAINT = 0.01
+"""Share of pixels with ink below which a picture is taken for empty: a tenth of both its sides."""
 LOOKED_AT = 5
 """Steps of a series, evenly spread, that are looked at for the one of most structure."""
 GLANCE = 2**15
@@ -458,6 +460,18 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
     return replace(plan.task, light=light), light.secondary_rays
 
 
+def faint_text(image: Image, plan: Plan, volume: Volume) -> str:
+    """Text on a picture that has hardly any ink; empty for others."""
+    if image.ink >= FAINT:
+        return ""
+    low, high = volume.value_range.low, volume.value_range.high
+    why = "another step, opacity or zoom may show more" if low < high else f"all values are {low:g}"
+    return (
+        f"{image.ink:.2%} of the picture's pixels differ from the background at step "
+        f"{plan.step:g}: {why}"
+    )
+
+
 def _fullest_step(volume: Volume, plan: Plan) -> int:
     """The step of most structure among LOOKED_AT of them, the earliest of equal ones."""
     last, parts = volume.shape[0] - 1, LOOKED_AT - 1
@@ -470,10 +484,11 @@ def _fullest_step(volume: Volume, plan: Plan) -> int:
 
 
 def structure(values: npt.NDArray[Any], plan: Plan) -> float:
-    """How different neighbouring vertices (z, y, x) look in a picture.
+    """Sum of the differences of neighbouring vertices (z, y, x) as a picture shows them.
 
     What a vertex looks like is its opacity and, where it has some, its place in the colours.
     """
+    values = values.astype(np.float64)  # as scenes have numbers
     low, high = plan.function.colours.positions[[0, -1]]
     opacity = plan.function.opacity(values)
     with np.errstate(over="ignore", invalid="ignore"):

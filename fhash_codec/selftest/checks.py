@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.compact.goal import promise
+from fhash_codec.compact.model import CompactModel
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import Check, Finding, Run, environment
 from fhash_formats.errors import InputError
@@ -23,9 +24,6 @@ N_REGIONS = 6
 """Random regions of each run."""
 N_POINTS = 32
 """Random vertices of each run that are sampled."""
-ROUNDING = 1e-5
-"""Allowed difference between a point and the same vertex in profile paper, as a share of the range:
-float32 sums in another order."""
 WEIGHTS = (0.25, 0.5, 0.875)
 """Positions between two steps, as shares of the distance between them."""
 
@@ -103,7 +101,7 @@ def points(run: Run) -> Iterator[Finding]:
         wrong = _count((sampled != expected) & ~np.isnan(expected))
         yield Finding("points = read", wrong, 0.0, "values")
         return
-    yield Finding("points = read", rounding(run, sampled, expected), 1.0, "of 1e-5 of the range")
+    yield Finding("points = read", rounding(run, sampled, expected), 1.0, "of the rounding")
 
 
 def levels_of_detail(run: Run) -> Iterator[Finding]:
@@ -127,14 +125,17 @@ ACCESS_CHECKS = (regions, key_times, between, points, levels_of_detail)
 
 
 def rounding(run: Run, one: Values, other: Values) -> float:
-    """The largest difference of two arrays, as a multiple of what profile paper may round.
+    """The largest difference of two arrays, as a multiple of what may be rounded.
 
-    It may round 1e-5 of the range, plus the epsilon of the dtype times the largest value.
+    That is what a network's outputs may differ by, plus the epsilon of the dtype times the largest
+    value.
     """
+    model = run.volume._model
+    share = 0.0 if isinstance(model, CompactModel) else model.network.rounding()
     kind = np.finfo(run.decoded.dtype)
     low, high = (end / 2 for end in (run.volume.value_range.low, run.volume.value_range.high))
     allowed = (
-        ROUNDING * (high - low)
+        share * (high - low)
         + float(kind.eps) * max(abs(low), abs(high))
         + float(kind.smallest_subnormal)
     )

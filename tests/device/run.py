@@ -440,15 +440,8 @@ def card(run: Run) -> Iterator[Result]:
     from PIL import Image
 
     path, data = run.work / "front.fhz", run.data
-    words = [
-        "encode",
-        str(data),
-        "-o",
-        str(path),
-        "--profile=paper",
-        "--tables=float16",
-        "--explain",
-    ]
+    options = ["--profile=paper", "--tables=float16", "--explain"]
+    words = ["encode", str(data), "-o", str(path), *options]
     encoded = fhash([*words, "--device", run.device, "--epochs", str(run.epochs)])
     trained = fhash(["info", str(path)])["training"]
     result = {

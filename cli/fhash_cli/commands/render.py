@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import json
 import typing
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +29,9 @@ from fhash_cli.options import (
     run_argument,
     variable_option,
 )
-from fhash_cli.output import Progress, emit, extent, number, table
+from fhash_cli.output import Progress, emit, extent, number, say, table
 from fhash_cli.selection import steps_of, time_of
-from fhash_formats.errors import FhashWarning, InputError, suggestion
+from fhash_formats.errors import InputError, suggestion
 from fhash_formats.support.files import file_name
 
 if TYPE_CHECKING:
@@ -42,9 +41,6 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.scenes import Scene
     from fhash_codec.rendering.tracking import Followed, Tracked
 
-FAINT = 0.01
-"""Share of pixels with ink below which a picture is taken for empty: a square of a tenth of its
-sides."""
 NUMBERS = {2: "A,B", 3: "X,Y,Z"}
 """Placeholders of options that take so many numbers."""
 
@@ -717,7 +713,7 @@ def command(
     is. With --animate the output is NAME.png for numbered pictures, of which only missing ones are
     drawn, or a film NAME.mp4 or NAME.gif.
     """
-    from fhash_codec.rendering.renderer import Renderer
+    from fhash_codec.rendering.renderer import Renderer, faint_text
     from fhash_codec.times import is_static, time_text
     from fhash_codec.volume import open as open_volume
 
@@ -732,22 +728,18 @@ def command(
                     " leave them out of an animation or evolution"
                 )
             draw = _draw_evolution if several.animate is None else _animate
-            drawn, text = draw(
-                volume, scene, several, str(path), force=picture.force, progress=progress
-            )
-            emit(drawn, text, as_json)
-            return
+            found = draw(volume, scene, several, str(path), force=picture.force, progress=progress)
+            return emit(found[0], found[1], as_json)
         scene = tracking(volume, scene, several, progress)
         _check_outputs(path, picture, scene, run)
         renderer = Renderer(volume)
         plan = renderer.plan(scene)
-        chosen = plan.scene.step is not None and scene.step is None
         image = renderer.render(plan=plan, progress=progress)
         times = volume.coords["t"]
         time = "" if is_static(times) else f"{plan.step:g}, t = {time_text(times, plan.time)}"
-        time += ", of five steps the one of most structure" if chosen else ""
-        if image.ink < FAINT:
-            _warn_of_a_faint_picture(volume, plan.step, image.ink)
+        time += "" if plan.scene == scene else ", of five steps the one of most structure"
+        if faint := faint_text(image, plan, volume):
+            say(faint)
     paths = [str(written) for written in _save(image, path, picture)]
     result: Rendered = {
         "paths": paths,
@@ -762,18 +754,6 @@ def command(
     if picture.explain:
         result["plan"] = plan.to_dict()
     emit(result, _text(plan, image, time, paths, picture.explain), as_json)
-
-
-def _warn_of_a_faint_picture(volume: Volume, step: float, ink: float) -> None:
-    low, high = volume.value_range.low, volume.value_range.high
-    why = "another --t, --opacity or --zoom may show more"
-    if low == high:
-        why = f"all values are {low:g}"
-    warnings.warn(
-        f"{ink:.2%} of the picture's pixels differ from the background at step {step:g}: {why}",
-        FhashWarning,
-        stacklevel=2,
-    )
 
 
 def _check_outputs(path: Path, picture: PictureOptions, scene: Scene, run: str) -> None:
