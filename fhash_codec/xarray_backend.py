@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +21,7 @@ from fhash_codec.appending.growing import bound_of_file
 from fhash_codec.boxes import Box, index_ranges, slice_of
 from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
-from fhash_codec.dataset import Handle, absolute, acquire, release
+from fhash_codec.dataset import Handle, absolute, acquire, held_again, release
 from fhash_codec.encoding import encode
 from fhash_codec.header import figure_attributes, history_line, source_attributes, without_figures
 from fhash_codec.volume import OUTSIDE, Volume, holds
@@ -176,35 +177,51 @@ class Form:
         return {name: min(tile.get(axis, 1), sizes[name]) for name, axis in self.dimensions.items()}
 
 
+def _nothing() -> None:
+    """The handle of an array whose file is not open."""
+
+
 class FhashArray(BackendArray):
-    """A variable of a container, decoded as it is indexed; pickled as its place."""
+    """A variable of a container, decoded as it is indexed; pickled as its place.
+
+    An array of a path does not hold the file open: a dataset may have more files than descriptors.
+    """
 
     def __init__(
-        self, place: str, name: str, form: Form, storage_options: Mapping[str, Any] | None
+        self, place: Any, name: str, form: Form, storage_options: Mapping[str, Any] | None
     ) -> None:
         self._place, self._name, self._form = place, name, form
         self._options = storage_options
-        self._handle: Handle | None = acquire(place, storage_options)
-        self._digest = self._handle.digest
-        volume = self._handle.volumes[name]
+        handle = acquire(place, storage_options)
+        self._handle: Callable[[], Handle | None] = self._holding(handle)
+        self._digest = handle.digest
+        volume = handle.volumes[name]
         self.shape = tuple(form.sizes(volume).values())
         self.dtype = volume.dtype if form.lod is None else volume.float_dtype
 
     def _opened(self) -> Handle:
         """The open file, for as long as it is held; InputError where it has been replaced."""
-        handle = self._handle
+        handle = self._handle()
         if handle is None or not handle.is_of_this_process():
-            handle = self._handle = acquire(self._place, self._options, self._digest)
+            handle = acquire(self._place, self._options, self._digest)
+            self._handle = self._holding(handle)
+        elif isinstance(self._place, str):
+            held_again(handle)
         return handle
+
+    def _holding(self, handle: Handle) -> Callable[[], Handle | None]:
+        """A way to the open file, which holds only what cannot be opened again."""
+        return weakref.ref(handle) if isinstance(self._place, str) else lambda: handle
 
     def release(self) -> None:
         """Close the file, unless others read from it; the next reading opens it again."""
-        if self._handle is not None:
-            release(self._handle)
-            self._handle = None
+        handle = self._handle()
+        if handle is not None:
+            release(handle)
+        self._handle = _nothing
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_handle": None}
+        return {**self.__dict__, "_handle": _nothing}
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(
@@ -380,11 +397,11 @@ class Shown:
         self._beside = self._variables()
         self.coordinates = {each.name for each in self._beside if each.is_coordinate}
 
-    def values(self, array: FhashArray, place: str) -> xr.Variable:
+    def values(self, array: FhashArray, place: Any) -> xr.Variable:
         """The values, not decoded."""
         encoding = {
             "preferred_chunks": self.form.chunks(self._volume),
-            "source": place,
+            **({"source": place} if isinstance(place, str) else {}),
         }
         lazy = indexing.LazilyIndexedArray(array)
         return xr.Variable(
