@@ -114,21 +114,26 @@ class Dataset(Mapping[str, Volume]):
         return f"<fhash Dataset {', '.join(self)[:200]} of {self.path}>"
 
 
-KEPT = 16
-"""Files that stay open although nobody holds them: a task after the other uses them again."""
+KEPT = 128
+"""Files that stay open, as many as xarray's own engines keep: a task after the other uses them
+again, and a dataset of any number of files needs no more descriptors."""
 
 Key = tuple[Any, ...]
 
 
-def volumes_of(path: str, storage_options: Mapping[str, Any] | None = None) -> Mapping[str, Volume]:
+def volumes_of(
+    path: Place, storage_options: Mapping[str, Any] | None = None
+) -> Mapping[str, Volume]:
     """The variables of a container by name, opened; `storage_options` are for a URL."""
     options: dict[str, Any] = {"storage_options": storage_options} if storage_options else {}
     opened = open(path, **options)
     return opened if isinstance(opened, Dataset) else {opened.name: opened}
 
 
-def absolute(path: str | os.PathLike[str]) -> str:
-    """A path as another process finds it: absolute, or a URL."""
+def absolute(path: Any) -> Any:
+    """A path as another process finds it: absolute, or a URL; an open file as it is."""
+    if not isinstance(path, str | os.PathLike):
+        return path
     text = os.fspath(path)
     return text if "://" in text else os.path.abspath(text)
 
@@ -160,12 +165,13 @@ _kept: OrderedDict[Key, Handle] = OrderedDict()
 
 
 def acquire(
-    place: str, storage_options: Mapping[str, Any] | None = None, digest: str | None = None
+    place: Any, storage_options: Mapping[str, Any] | None = None, digest: str | None = None
 ) -> Handle:
-    """The volumes of a file, opened once for each of its states.
+    """The volumes of a file, opened once for each of its states; `KEPT` of them stay open.
 
+    place: as `absolute` gives it; an open file is read as long as somebody holds its handle.
     digest: of the container that is meant; None for any. Raises InputError where the file is
-    another one by now, and as `fhash_codec.open` does.
+        another one by now, and as `fhash_codec.open` does.
     """
     key = (*_state(place), repr(sorted((storage_options or {}).items())), os.getpid())
     with _lock:
@@ -174,11 +180,22 @@ def acquire(
             handle = _open[key] = Handle(key, volumes_of(place, storage_options))
         if digest is not None and handle.digest != digest:
             raise InputError(f"{place} is another file than the one that was opened; open it again")
-        _kept[key] = handle
-        _kept.move_to_end(key)
-        while len(_kept) > KEPT:
-            _kept.popitem(last=False)
+        if isinstance(place, str):
+            _keep(handle)
     return handle
+
+
+def held_again(handle: Handle) -> None:
+    """Note that a file is read, so that others are closed before it."""
+    with _lock:
+        _keep(handle)
+
+
+def _keep(handle: Handle) -> None:
+    _kept[handle.key] = handle
+    _kept.move_to_end(handle.key)
+    while len(_kept) > KEPT:
+        _kept.popitem(last=False)
 
 
 def release(handle: Handle) -> None:
@@ -187,8 +204,10 @@ def release(handle: Handle) -> None:
         _kept.pop(handle.key, None)
 
 
-def _state(place: str) -> Key:
-    """The place, and what changes with its content; of a URL the place alone."""
+def _state(place: Any) -> Key:
+    """The place, and what changes with its content; of a URL and an open file the place alone."""
+    if not isinstance(place, str):
+        return (id(place),)
     if "://" in place:
         return (place,)
     try:

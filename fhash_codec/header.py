@@ -110,6 +110,11 @@ def figure_attributes(header: Mapping[str, Any]) -> dict[str, float]:
     return {key: value for key, value in found.items() if value is not None}
 
 
+def without_figures(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes without figures of an earlier file, from which the values came."""
+    return {key: value for key, value in attributes.items() if key not in FIGURES}
+
+
 def source_attributes(metadata: SourceMetadata) -> dict[str, str]:
     """Attributes of a file that name its source and the digest of it, as far as they are known."""
     named = {"fhash_source": metadata.file, "fhash_source_digest": metadata.digest}

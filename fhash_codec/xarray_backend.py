@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,12 +17,13 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
+from fhash_codec.appending.growing import bound_of_file
 from fhash_codec.boxes import Box, index_ranges, slice_of
 from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
-from fhash_codec.dataset import Handle, absolute, acquire, release
+from fhash_codec.dataset import Handle, absolute, acquire, held_again, release
 from fhash_codec.encoding import encode
-from fhash_codec.header import figure_attributes, history_line, source_attributes
+from fhash_codec.header import figure_attributes, history_line, source_attributes, without_figures
 from fhash_codec.volume import OUTSIDE, Volume, holds
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError, UnsupportedFileError
@@ -175,35 +177,51 @@ class Form:
         return {name: min(tile.get(axis, 1), sizes[name]) for name, axis in self.dimensions.items()}
 
 
+def _nothing() -> None:
+    """The handle of an array whose file is not open."""
+
+
 class FhashArray(BackendArray):
-    """A variable of a container, decoded as it is indexed; pickled as its place."""
+    """A variable of a container, decoded as it is indexed; pickled as its place.
+
+    An array of a path does not hold the file open: a dataset may have more files than descriptors.
+    """
 
     def __init__(
-        self, place: str, name: str, form: Form, storage_options: Mapping[str, Any] | None
+        self, place: Any, name: str, form: Form, storage_options: Mapping[str, Any] | None
     ) -> None:
         self._place, self._name, self._form = place, name, form
         self._options = storage_options
-        self._handle: Handle | None = acquire(place, storage_options)
-        self._digest = self._handle.digest
-        volume = self._handle.volumes[name]
+        handle = acquire(place, storage_options)
+        self._handle: Callable[[], Handle | None] = self._holding(handle)
+        self._digest = handle.digest
+        volume = handle.volumes[name]
         self.shape = tuple(form.sizes(volume).values())
         self.dtype = volume.dtype if form.lod is None else volume.float_dtype
 
     def _opened(self) -> Handle:
         """The open file, for as long as it is held; InputError where it has been replaced."""
-        handle = self._handle
+        handle = self._handle()
         if handle is None or not handle.is_of_this_process():
-            handle = self._handle = acquire(self._place, self._options, self._digest)
+            handle = acquire(self._place, self._options, self._digest)
+            self._handle = self._holding(handle)
+        elif isinstance(self._place, str):
+            held_again(handle)
         return handle
+
+    def _holding(self, handle: Handle) -> Callable[[], Handle | None]:
+        """A way to the open file, which holds only what cannot be opened again."""
+        return weakref.ref(handle) if isinstance(self._place, str) else lambda: handle
 
     def release(self) -> None:
         """Close the file, unless others read from it; the next reading opens it again."""
-        if self._handle is not None:
-            release(self._handle)
-            self._handle = None
+        handle = self._handle()
+        if handle is not None:
+            release(handle)
+        self._handle = _nothing
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_handle": None}
+        return {**self.__dict__, "_handle": _nothing}
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(
@@ -257,6 +275,9 @@ class FhashArray(BackendArray):
 SUFFIX = ".fhz"
 FILLS = ("_FillValue", "missing_value")
 """Attributes that say which number stands for a missing value."""
+MAX_ERROR = "fhash_max_error"
+ROUNDED = 1e-6
+"""Share of a count by which arithmetic of floats may miss the middle between two."""
 VALID = ("valid_min", "valid_max", "valid_range")
 """Attributes that xarray leaves where they are."""
 
@@ -324,7 +345,7 @@ class FhashBackend(BackendEntrypoint):
             {shown_as[name]: shown.form.dimensions for name, shown in chosen.items()}
         )
         attributes: dict[str, Any] = {}
-        coordinates: set[str] = set()
+        coordinates, growing = set[str](), set[str]()
         arrays: list[FhashArray] = []
         packed: dict[str, dict[str, Any]] = {}
         for name, shown in chosen.items():
@@ -333,6 +354,7 @@ class FhashBackend(BackendEntrypoint):
             attributes = shown.attributes()
             coordinates |= {beside[each] for each in shown.coordinates} - set(shown_as.values())
             packed[shown_as[name]] = shown.packing()
+            growing |= shown.unlimited(joined.variables[shown_as[name]].dims)
             arrays.append(array)
         decoded = xr.conventions.decode_cf(
             _dataset(joined.variables, attributes, place),
@@ -349,6 +371,7 @@ class FhashBackend(BackendEntrypoint):
         for name, encoding in packed.items():
             if name in decoded.variables:
                 decoded.variables[name].encoding |= encoding
+        decoded.encoding |= {"unlimited_dims": growing} if growing else {}
         decoded.set_close(partial(_release, arrays))
         return decoded
 
@@ -374,11 +397,11 @@ class Shown:
         self._beside = self._variables()
         self.coordinates = {each.name for each in self._beside if each.is_coordinate}
 
-    def values(self, array: FhashArray, place: str) -> xr.Variable:
+    def values(self, array: FhashArray, place: Any) -> xr.Variable:
         """The values, not decoded."""
         encoding = {
             "preferred_chunks": self.form.chunks(self._volume),
-            "source": place,
+            **({"source": place} if isinstance(place, str) else {}),
         }
         lazy = indexing.LazilyIndexedArray(array)
         return xr.Variable(
@@ -399,11 +422,18 @@ class Shown:
             return with_history({}, history_line(volume.container.header))
         return {**metadata.attributes, **source_attributes(metadata)}
 
+    def unlimited(self, names: Iterable[Hashable]) -> set[str]:
+        """The dimensions that can grow in the source. names: of all of them as they are shown."""
+        told = () if self._metadata is None else self._metadata.unlimited
+        shown = zip(self.form.dimensions, names, strict=True)
+        return {str(name) for own, name in shown if own in told}
+
     def packing(self) -> dict[str, Any]:
         """The packing of the source, for `encoding`; none where the decoded values do not fit it.
 
         A value beyond the stored type would wrap, one that is coded as the fill value would become
-        a missing one, and a vertex without a value would be written as some number.
+        a missing one, a vertex without a value would be written as some number, and rounding could
+        lead beyond the bound.
         """
         if self._metadata is None or self._volume.dtype.kind != "f":
             return {}
@@ -414,7 +444,36 @@ class Shown:
             if self._volume.value_type.has_gaps and not set(FILLS) & set(found):
                 return {}
             found["dtype"] = np.dtype(stored)
-        return found if self._fits(found) else {}
+        if not self._fits(found):
+            return {}
+        header = self._volume.container.header
+        error = header["quality"].get("max_abs_error")
+        bound = bound_of_file(header) or 0.0
+        kept = error is not None and self.packed_error(found) <= max(error, bound)
+        return found if kept or not self._rounds(found) else {}
+
+    def _rounds(self, packing: Mapping[str, Any]) -> bool:
+        """Whether a packing changes decoded values."""
+        dtype = np.dtype(packing.get("dtype", self._volume.dtype))
+        return dtype != self._volume.dtype or bool(SCALING & packing.keys())
+
+    def packed_error(self, packing: Mapping[str, Any]) -> float:
+        """The largest error of values that are written in a packing of the source again.
+
+        The values of the source are whole counts, and so is what rounding makes of decoded ones:
+        those that are nearer than half a count come back as they were.
+        """
+        header = self._volume.container.header
+        error = float(header["quality"].get("max_abs_error") or 0.0)
+        if error == 0 or not self._rounds(packing):
+            return error
+        dtype = np.dtype(packing.get("dtype", self._volume.dtype))
+        scale = abs(float(np.ravel(packing.get("scale_factor", 1))[0]))
+        if dtype.kind in "iu":
+            return float(scale * np.floor(error / scale + 0.5 + ROUNDED))
+        offset = float(np.ravel(packing.get("add_offset", 0))[0])
+        largest = max(abs(float(end) - offset) for end in header["value_range"])
+        return error + float(np.finfo(dtype).eps) * largest
 
     def _fits(self, packing: Mapping[str, Any]) -> bool:
         """Whether every decoded value has a number of the packed type that is no fill value."""
@@ -479,7 +538,11 @@ class Shown:
                 found[FILLS[0]] = volume.dtype.type(fill)
         if self.form.lod is not None:
             return found  # the figures are those of all vertices
-        return found | figure_attributes(volume.container.header)
+        figures = figure_attributes(volume.container.header)
+        packing = self.packing()
+        if packing and figures.get(MAX_ERROR):
+            figures[MAX_ERROR] = max(figures[MAX_ERROR], self.packed_error(packing))
+        return without_figures(found) | figures
 
 
 def _invented(volume: Volume) -> dict[str, str]:

@@ -36,7 +36,7 @@ from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
 from fhash_formats.support.threads import chunk_region
-from fhash_formats.support.values import Values, exact_number, is_within
+from fhash_formats.support.values import PACKING, Values, exact_number, is_within
 from fhash_formats.transform.tile import TRELLIS_WEIGHT, WEIGHT, CodedTile, decode_tile
 from fhash_formats.transform.tile_format import TileSettings, parse_stream
 
@@ -356,6 +356,14 @@ class GrowingFile:
         known = self._coords["t"]
         values = np.array(self._times, dtype=np.float64)
         return Coordinate(name=known.name, values=values, attributes=known.attributes)
+
+    def forget_packing(self) -> None:
+        """Keep no packing of the source: the steps that follow are no counts of it."""
+        if SOURCE in self._header:
+            source = {key: each for key, each in self._header[SOURCE].items() if key != "stored"}
+            own = source.get("variable", {})
+            source["variable"] = {key: each for key, each in own.items() if key not in PACKING}
+            self._header[SOURCE] = source
 
     def note(self, never: NotStored | None, count: int) -> None:
         """Keep in the header what nobody wrote of the next `count` steps, and of those before."""

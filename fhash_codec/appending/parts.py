@@ -427,7 +427,7 @@ class _Piece:
 
     @cached_property
     def labels(self) -> Labels:
-        """What tells its series from others."""
+        """The labels that tell its series from others."""
         coords = {axis: self.container.coordinate(AXIS_NAMES[axis]) for axis in AXES}
         return Labels.of_file(self.path, self.container.header, coords)
 

@@ -46,6 +46,7 @@ from fhash_formats.series import (
     ArraySeries,
     Coordinate,
     Series,
+    SourceMetadata,
     check_values,
     index_coordinate,
 )
@@ -252,6 +253,7 @@ class Writer:
         growing = stack.enter_context(continued(Path(path), steps))
         z, y, x = growing.shape
         self._begin(Path(path), (z, y, x))
+        growing.forget_packing()
         self._stack, self._file = stack, growing
         with open_volume(path) as volume:
             self._labels = _labels_of(volume)
@@ -492,7 +494,10 @@ def append(
     with open_source(source) as series:
         with open_volume(path) as volume:
             _require_same(series, volume)
+            packed = _packing(series.metadata) == _packing(volume.metadata)
         with continued(path, keep) as growing:
+            if not packed:
+                growing.forget_packing()
             kept = growing.steps
             growing.note(series.not_stored, series.shape[0])
             times = _times(series, growing)
@@ -546,6 +551,19 @@ def _frame(series: Series, step: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
             "makes floats of: they are rounded; --raw-values reads them as they are stored"
         )
     return frame.astype(dtype, copy=False)
+
+
+def _packing(metadata: SourceMetadata | None) -> tuple[Any, ...]:
+    """The packing of a source, for comparison."""
+    if metadata is None:
+        return ()
+    told = metadata.variable_attributes
+    scales = (float(np.ravel(told.get(key, unit))[0]) for key, unit in (*SCALES.items(),))
+    return metadata.stored, *scales
+
+
+SCALES = {"scale_factor": 1.0, "add_offset": 0.0}
+"""Attributes of a packing, and what they are where they are left out."""
 
 
 def _labels_of(volume: Volume) -> Labels:

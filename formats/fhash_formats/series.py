@@ -102,6 +102,7 @@ class SourceMetadata:
         stored: number type of the stored values, where it is not that of the decoded ones.
         file: name of the file, without folders; None for data in memory.
         digest: SHA-256 of the file, hexadecimal; None where it was not taken.
+        unlimited: those of the dimensions that can grow in the file.
     """
 
     dimensions: Mapping[str, str]
@@ -111,6 +112,7 @@ class SourceMetadata:
     stored: str | None = None
     file: str | None = None
     digest: str | None = None
+    unlimited: tuple[str, ...] = ()
 
     def cut(self, places: Mapping[str, Places]) -> SourceMetadata:
         """The metadata of a part of the variable.
@@ -275,6 +277,7 @@ def with_plain_names(metadata: SourceMetadata) -> tuple[SourceMetadata, dict[str
     return replace(
         metadata,
         dimensions={names.get(name, name): axis for name, axis in metadata.dimensions.items()},
+        unlimited=tuple(names.get(name, name) for name in metadata.unlimited),
         variable_attributes=renamed(metadata.variable_attributes, names),
         variables=variables,
     ), names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 import tomllib
 import warnings
@@ -606,3 +607,45 @@ def test_a_file_and_its_dataset_of_two_variables_give_the_same_bytes(tmp_path) -
     with xr.open_dataset(tmp_path / "a.nc", decode_times=False) as data:
         fhash_codec.encode_dataset(data, tmp_path / "data.fhz", QUICK)
     assert (tmp_path / "path.fhz").read_bytes() == (tmp_path / "data.fhz").read_bytes()
+
+
+def test_many_files_need_few_descriptors_and_open_files_are_read(tmp_path, monkeypatch) -> None:
+    values = np.random.default_rng(0).random((2, 3, 4, 5), dtype="f4")
+    config = EncodeConfig(max_error=0.01, effort=1)
+    paths = [tmp_path / f"{number}.fhz" for number in range(6)]
+    for path in paths:
+        fhash_codec.encode(values, path, config)
+    monkeypatch.setattr("fhash_codec.dataset.KEPT", 2)
+    opened = [xr.open_dataset(path, engine="fhash") for path in paths]
+    from fhash_codec import dataset
+
+    here = [key for key in dataset._open if str(key[0]).startswith(str(tmp_path))]
+    assert len(here) <= 2
+    for each in (*opened, *opened):
+        (name,) = each.data_vars
+        assert np.abs(each[name].values - values).max() < 0.011
+    for file in (io.BytesIO(paths[0].read_bytes()), paths[0].open("rb")):
+        with file, xr.open_dataset(file, engine="fhash") as found:
+            (name,) = found.data_vars
+            np.testing.assert_array_equal(found[name], opened[0][name])
+
+
+def test_packing_and_record_dimensions_are_handed_on_within_the_bound(tmp_path) -> None:
+    counts = np.rint(1000 * np.sin(np.arange(2 * 3 * 4 * 5) / 9)).astype("f8").reshape(2, 3, 4, 5)
+    source = xr.Dataset({"v": (("time", "z", "y", "x"), counts / 1000)})
+    packing = {"dtype": "int16", "scale_factor": 0.001, "_FillValue": -32768}
+    source.to_netcdf(
+        tmp_path / "a.nc", engine="h5netcdf", encoding={"v": packing}, unlimited_dims=["time"]
+    )
+    for bound, packed in ((0.0004, True), (0.0007, False), (0.003, None)):
+        config = EncodeConfig(max_error=bound, effort=1)
+        fhash_codec.encode(tmp_path / "a.nc", tmp_path / "o.fhz", config, force=True)
+        with xr.open_dataset(tmp_path / "o.fhz") as found:
+            assert found.encoding["unlimited_dims"] == {"time"}
+            assert packed is None or ("scale_factor" in found["v"].encoding) == packed
+            found.to_netcdf(tmp_path / "r.nc", engine="h5netcdf")
+        with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
+            error = np.abs(again["v"].values - counts / 1000).max()
+            assert error <= bound * (1 + 1e-6)
+            assert error <= again["v"].attrs["fhash_max_error"] * (1 + 1e-6)
+            assert again.encoding["unlimited_dims"] == {"time"}

@@ -546,9 +546,14 @@ def _save_regions(output: str, parts: Sequence[Part], force: bool, run: str) -> 
 
 def _region(part: Part) -> Region:
     """The description of the frames for a writer."""
+    from fhash_codec.header import without_figures
     from fhash_formats.writers.common import Region
 
     volume, chosen = part.volume, part.selection
+    beside = metadata(volume, chosen.steps, chosen.vertices)
+    if beside is not None:
+        own = without_figures(beside.variable_attributes)
+        beside = replace(beside, variable_attributes=own)
     return Region(
         name=volume.name,
         units=volume.units,
@@ -556,8 +561,8 @@ def _region(part: Part) -> Region:
         fill=chosen.fill if volume.value_type.has_gaps else None,
         shape=chosen.shape,
         coords=coordinates(volume, chosen.steps, chosen.vertices),
-        attributes=volume.attrs,
-        metadata=metadata(volume, chosen.steps, chosen.vertices),
+        attributes=without_figures(volume.attrs),
+        metadata=beside,
     )
 
 

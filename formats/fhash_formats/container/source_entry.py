@@ -145,6 +145,7 @@ def read_metadata(
         stored=entry.get("stored"),
         file=entry.get("file"),
         digest=entry.get("digest"),
+        unlimited=tuple(entry.get("unlimited", ())),
     )
 
 
@@ -166,6 +167,9 @@ def _parsed(
     for key in ("file", "digest", "date"):
         if top.has(key):
             top.text(key)
+    if top.has("unlimited"):
+        known = set(top.texts("unlimited")) <= set(dimensions)
+        top.need(known, "unlimited", "names of dimensions")
     if top.has("stored"):
         top.choice("stored", tuple(DTYPES))
     _changed(header[SOURCE].get("variable", {}), header["variable"]["attributes"], room)
@@ -379,6 +383,7 @@ def describe_metadata(
     described = [_described(variable, metadata, coords, arrays) for variable in metadata.variables]
     optional = {
         "lengths": lengths,
+        "unlimited": list(metadata.unlimited),
         "variables": described,
         "variable": _difference(metadata.variable_attributes, attributes),
         "attributes": _difference(metadata.attributes, {}),

@@ -1,4 +1,4 @@
-"""Which series belong together: one quantity on one grid, and times that go on.
+"""Rules of which series belong together: one quantity on one grid, and times that go on.
 
 Files of a pattern, `append`, `Writer`, and parts of a series ask here. What one of two does not say
 is no difference: it is taken to be what the other says.
@@ -45,7 +45,7 @@ Parts = Sequence[tuple[Path, Coordinate]]
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
-    """What tells a series from others.
+    """The labels that tell a series from others.
 
     Attributes:
         source: its path, for messages.
@@ -124,7 +124,7 @@ def require_alike(one: Labels, other: Labels) -> None:
 
 
 Difference = tuple[str, tuple[str, ...], str]
-"""What differs, how it is in the one and in the other series, and what to do."""
+"""A difference: its subject, how it is in the one and in the other series, and what to do."""
 
 
 def _differences(one: Labels, other: Labels) -> Iterator[Difference]:

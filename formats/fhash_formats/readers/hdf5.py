@@ -421,6 +421,13 @@ class _Variables:
             read=_padded(dataset, shape, dtype, text=text),
             chunks=dataset.chunks,
             auxiliary=bool(dataset.is_scale),
+            unlimited=[
+                name
+                for name, most in zip(names, dataset.maxshape, strict=True)
+                if name and most is None
+            ]
+            if self.netcdf
+            else (),
             scales={
                 name: scale
                 for name, scale in zip(names, scales, strict=True)

@@ -211,6 +211,7 @@ def _source(array: Any, beside: Any, name: str) -> Source:
         read=lambda places: as_array(own[places], f"array '{name}'"),
         chunks=own.chunks or own.encoding.get("chunksizes"),
         behind=lambda: _behind(own),
+        unlimited=sorted(map(str, beside.encoding.get("unlimited_dims") or ())),
         handle=own.encoding,
     )
     naming = {
@@ -391,8 +392,9 @@ def open_url(url: str, request: Request) -> Source:
             dataset = xr.open_dataset(stored, engine="h5netcdf", phony_dims="sort", **wishes)
 
     def reader(array: Any) -> Read:
-        return lambda places: np.asarray(array[places].values)
+        return lambda places: as_array(array[places])
 
+    unlimited = sorted(map(str, dataset.encoding.get("unlimited_dims") or ()))
     variables = [
         Variable(
             name=str(key),
@@ -403,6 +405,7 @@ def open_url(url: str, request: Request) -> Source:
             attributes=each.attrs,
             read=reader(each),
             chunks=each.encoding.get("chunks") or each.encoding.get("chunksizes"),
+            unlimited=unlimited,
         )
         for key, each in dataset.variables.items()
     ]

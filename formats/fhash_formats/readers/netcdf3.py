@@ -198,6 +198,7 @@ def _parsed(path: Path, data: bytes, size: int) -> tuple[dict[str, Any], list[Va
                 dimensions=dims,
                 attributes=own,
                 read=partial(_read, path, kind, shape, begin, strides),
+                unlimited=[d for d in dims if lengths[d] is None],
             )
         )
     return attributes, variables

@@ -184,7 +184,9 @@ def metadata_of(
         digested=request.digested,
     )
     selected = replace(own, attributes={**own.attributes, **layout.attributes()})
-    return with_times(surroundings(wanted, {**variables, name: selected}, attributes), time)
+    found = surroundings(wanted, {**variables, name: selected}, attributes)
+    growing = tuple(each for each in own.unlimited if each in found.dimensions)
+    return with_times(replace(found, unlimited=growing), time)
 
 
 def digest_of(path: Path) -> str | None:

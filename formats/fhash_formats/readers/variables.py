@@ -105,6 +105,7 @@ class Variable:
         require: raises what is missing where the values cannot be read here.
         flat: whether its name has no groups, whatever letters it has.
         computed: whether its values follow from a header, so that they are not kept beside others.
+        unlimited: names of its dimensions that can grow.
         handle: whatever else the reader needs; where `values` is given, what packs them.
         field: path of names in a compound type, () where the array is no such.
         members: arrays of the same kind, one a step; () for an array that the file holds as one
@@ -129,6 +130,7 @@ class Variable:
     require: Callable[[], None] = lambda: None
     flat: bool = False
     computed: bool = False
+    unlimited: Sequence[str] = ()
     handle: Any = None
     field: tuple[str, ...] = ()
     members: tuple[Variable, ...] = ()

@@ -322,6 +322,7 @@ class Outline:
         attributes: of the variable, JSON values or numpy's; no packing.
         variables: the arrays beside it.
         file_attributes: of the file.
+        unlimited: those of the dimensions that can grow.
     """
 
     name: str
@@ -330,6 +331,7 @@ class Outline:
     attributes: Mapping[str, Any]
     variables: tuple[SourceVariable, ...]
     file_attributes: Mapping[str, Any]
+    unlimited: Sequence[str] = ()
 
     @classmethod
     def of(cls, region: Region) -> Outline:
@@ -368,6 +370,7 @@ class Outline:
             attributes=_attributes(region, metadata, variables),
             variables=tuple(variables),
             file_attributes=_without(metadata.attributes, PLUMBING),
+            unlimited=metadata.unlimited,
         )
 
     @property

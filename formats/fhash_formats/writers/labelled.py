@@ -103,7 +103,10 @@ def _open_netcdf(regions: Regions, outputs: Paths, temporaries: Paths) -> Opened
 
     def create(root: Any) -> Puts:
         _set_attributes(root, {"Conventions": "CF-1.8", **attributes})
-        root.dimensions = lengths
+        growing = {name for outline in outlines for name in outline.unlimited}
+        root.dimensions = {n: None if n in growing else each for n, each in lengths.items()}
+        for name in growing:
+            root.resize_dimension(name, lengths[name])
         for each in beside:
             _add(root, each)
         pairs = zip(regions, outlines, strict=True)
@@ -136,9 +139,8 @@ def _add(root: Any, beside: SourceVariable) -> None:
     values = beside.values
     dtype: Any = h5py.string_dtype() if values.dtype.kind in "OTU" else little_endian(values.dtype)
     fill = beside.attributes.get(FILL) if values.dtype.kind in "iuf" else None
-    variable = root.create_variable(
-        beside.name, beside.dimensions, dtype, data=values.astype(dtype), fillvalue=fill
-    )
+    variable = root.create_variable(beside.name, beside.dimensions, dtype, fillvalue=fill)
+    variable[...] = values.astype(dtype)
     kept = {key: value for key, value in beside.attributes.items() if key not in (FILL, *PLUMBING)}
     _set_attributes(variable, kept)
 

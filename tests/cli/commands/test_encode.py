@@ -324,5 +324,7 @@ def test_unsuitable_files_are_refused(
 ) -> None:
     _, more, values = halves
     np.save(run.with_name("other.npy"), values[:, :5])
-    assert "shape (z, y, x)" in refused(2, "append", halves[0], run.with_name("other.npy"), "-q")
+    assert "has a frame (z, y, x) of shape (5, 7, 8)" in refused(
+        2, "append", halves[0], run.with_name("other.npy"), "-q"
+    )
     assert "no such file" in refused(2, "append", run.with_name("none.fhz"), more, "-q")

@@ -1,4 +1,4 @@
-"""Which series belong together."""
+"""Tests of which series belong together."""
 
 from __future__ import annotations
 
