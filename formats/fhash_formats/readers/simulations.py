@@ -72,7 +72,8 @@ class Blocks:
         covered = np.zeros(places, np.int32)
         ends = zip(self._low.T, self._high.T, edges, strict=True)
         cuts = [(np.searchsorted(e, low), np.searchsorted(e, high)) for low, high, e in ends]
-        for number in range(len(firsts)):
+        filled = np.prod([high - low for low, high in cuts], axis=0, dtype=np.float64).sum()
+        for number in range(len(firsts) if filled == prod(places) else 0):
             covered[tuple(slice(low[number], high[number]) for low, high in cuts)] += 1
         if (covered != 1).any():
             raise InputError("its blocks overlap, or leave cells of their grid out")

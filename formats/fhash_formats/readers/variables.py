@@ -25,6 +25,8 @@ MAX_LISTED = 12
 
 MADE_UP = "phony_dim_"
 """Beginning of the names that h5netcdf makes up for dimensions without one."""
+MAX_WHOLE = 1 << 26
+"""Values of an array beside others that is read at once, such as positions and tables."""
 MAX_LETTERS = 64
 """Letters of a date, or of a label."""
 
@@ -180,7 +182,9 @@ class Variable:
         return np.array([b"".join(row) for row in rows])
 
     def whole(self) -> npt.NDArray[Any]:
-        """All stored values."""
+        """All stored values; raises InputError for more than are read at once."""
+        if prod(self.shape) > MAX_WHOLE:
+            raise InputError(f"{self.name} has {prod(self.shape)} values; {MAX_WHOLE} are possible")
         return np.asarray(self.read((slice(None),) * len(self.shape)))
 
     def __str__(self) -> str:
