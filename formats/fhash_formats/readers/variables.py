@@ -17,7 +17,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.file_series import Stamp
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.stored_parts import StoredParts
-from fhash_formats.series import AXIS_NAMES, Coordinate, meant
+from fhash_formats.series import AXIS_NAMES, MAX_NAME, Coordinate, meant
 from fhash_formats.support.values import json_attributes, text_of
 
 MAX_LISTED = 12
@@ -419,7 +419,7 @@ def _step_path(path: str) -> _StepPath | None:
     """The part of a path that counts steps, None without one; the array's own name is none."""
     parts = path.split("/")
     for depth, part in enumerate(parts[:-1]):
-        match = NUMBERED.fullmatch(part)
+        match = NUMBERED.fullmatch(part) if len(part) <= MAX_NAME else None
         if match is None:
             continue
         word = match["word"].strip().lower()

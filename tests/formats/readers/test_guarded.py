@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,13 @@ import tifffile
 import zarr
 
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.cf import role_of_name
+from fhash_formats.readers.images import quoted, vectors
 from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.readers.simulations import Blocks
 from fhash_formats.readers.stored_bytes import numbers_in_text
+from fhash_formats.readers.variables import Variable, join
+from fhash_formats.support.dates import clock, in_days
 
 SOURCES = Path(__file__).parents[2] / "hard" / "fuzz" / "sources"
 """Sound files of each format that this project reads itself."""
@@ -205,6 +210,26 @@ def test_tables_and_positions_are_bounded(tmp_path: Path) -> None:
         file["v"].dims[0].attach_scale(file["time"])
     with pytest.raises(InputError, match=r"1073741824 .*possible"):
         open_series(tmp_path / "a.nc")
+
+
+def test_the_work_on_a_text_grows_with_its_length() -> None:
+    """Each took seconds for a header of 64 kB, or minutes."""
+    many, start = 60_000, time.process_time()
+    assert clock({"units": f"days since 2000{' ' * many}x"}) is None
+    assert in_days([0], {"units": f"months since 2000{' ' * many}x"}) is None
+    assert role_of_name("1" * many + "x") is None
+    assert join(
+        [Variable(name="_" * many + "/v", shape=(2, 2), dtype=np.dtype("f4"))], lambda path: {}
+    )
+    assert quoted('"' + '\\"' * many) == []
+    with pytest.raises(InputError):
+        vectors("( " * many)
+    assert time.process_time() - start < 1
+
+
+def test_labels_of_nrrd() -> None:
+    assert quoted('"a" "b c" "" "d\\"e" "f\\\\"') == ["a", "b c", "", 'd\\"e', "f\\\\"]
+    assert quoted("none") == []
 
 
 def test_nested_blocks_are_refused_at_once() -> None:
