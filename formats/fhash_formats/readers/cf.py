@@ -18,6 +18,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.series import (
     AXES,
     AXIS_NAMES,
+    MAX_NAME,
     Coordinate,
     Series,
     SourceMetadata,
@@ -313,7 +314,7 @@ AXIS_PATTERNS = {
 
 def role_of_name(name: str) -> str | None:
     """The axis of a conventional name in any case, or with a trailing number: "time_0"; or None."""
-    word = name.lower()
+    word = name[:MAX_NAME].lower()
     return ROLE_OF_NAME.get(word) or ROLE_OF_NAME.get(re.sub(r"(?<=..)_?\d+$", "", word))
 
 

@@ -278,6 +278,14 @@ def open_mrc(path: Path, request: Request) -> Source:
         if words[22] >= VOLUME_STACK and 0 < volumes < sizes[2] and sizes[2] % volumes == 0:
             sizes, names = [*sizes[:2], volumes, sizes[2] // volumes], [*letters, AXIS_NAMES["t"]]
         whole, stored = _volume(path, packed, sizes, names, np.dtype(order + kind), start)
+        angles = [float(each) for each in floats[13:16] if np.isfinite(each) and each > 0]
+        if any(abs(each - 90) > 1e-3 for each in angles):
+            warnings.warn(
+                f"{source}: its cell has the angles {', '.join(f'{n:.6g}' for n in angles)};"
+                " positions are along its own axes, as if these were at right angles",
+                FhashWarning,
+                stacklevel=2,
+            )
         # before 2013, IMOD wrote the place of the origin of the axes, and not that of the grid
         if flags is not None and not flags & IMOD_INVERTED and words[27] <= 0:
             floats[49:52] *= -1

@@ -17,7 +17,12 @@ import numpy.typing as npt
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
 from fhash_formats.readers.file_series import Request, Stamp, naming, refusing, require_length
 from fhash_formats.readers.layout import Read
-from fhash_formats.readers.simulations import athena_variables, flash_variables, in_place_of
+from fhash_formats.readers.simulations import (
+    athena_variables,
+    flash_variables,
+    in_place_of,
+    warn_of_system,
+)
 from fhash_formats.readers.stored_bytes import lattice
 from fhash_formats.readers.stored_parts import Hdf5Sources, hdf5_file
 from fhash_formats.readers.variables import (
@@ -276,6 +281,7 @@ def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
                 variables = flash_variables(variables)
             elif "NumMeshBlocks" in file.attrs:
                 variables = athena_variables(variables, Attributes(file))
+                warn_of_system(source, text_of(file.attrs.get("Coordinates", "")).strip())
             var = request.var and _own_name(file, tree.datasets, request.var)
         except BaseException:
             file.close()

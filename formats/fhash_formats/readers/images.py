@@ -297,11 +297,17 @@ def directions_of(fields: Fields, count: int) -> list[tuple[float, ...] | None] 
 def vectors(text: str) -> list[tuple[float, ...] | None]:
     """Vectors such as (1,0,0); None for "none", and for one of NaN, as pynrrd writes it."""
     found: list[tuple[float, ...] | None] = []
-    for word in re.findall(r"\([^)]*\)|\S+", text):
+    for word in re.findall(r"\([^()]*\)|\S+", text):
         parts = "nan" if word == "none" else word.strip("()")
         numbers = numbers_of(parts.replace(",", " "), parts.count(",") + 1)
         found.append(None if np.isnan(numbers).all() else tuple(numbers.tolist()))
     return found
+
+
+def quoted(text: str) -> list[str]:
+    """The texts between quotes, as they are written; a backslash precedes a quote inside."""
+    parts = text.replace("\\\\", "\0\0").replace('\\"', "\0\1").split('"')
+    return [each.replace("\0\1", '\\"').replace("\0\0", "\\\\") for each in parts[1:-1:2]]
 
 
 def is_nrrd(head: bytes, path: Path) -> bool:
@@ -329,7 +335,7 @@ def _axes(fields: Fields, pairs: Fields, sizes: Sequence[int]) -> list[str]:
     kinds = words_of(fields, "kinds", len(sizes), "domain")
     axes = [""] * len(sizes)
     vector = None
-    labels = re.findall(r'"((?:[^"\\]|\\.)*)"', fields.get("labels", ""))
+    labels = quoted(fields.get("labels", ""))
     space = fields.get("space", "")
     sequences = [
         place

@@ -27,7 +27,7 @@ from fhash_formats.readers.layout import Read, must_select, single
 from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.netcdf3 import matches as is_classic
 from fhash_formats.readers.select import Selection
-from fhash_formats.readers.stored_parts import labelled_parts
+from fhash_formats.readers.stored_parts import labelled_parts, require_alone
 from fhash_formats.readers.variables import (
     FIELD_DIMENSIONS,
     MAX_LISTED,
@@ -389,6 +389,8 @@ def open_url(url: str, request: Request) -> Source:
             else:
                 files, inside = fsspec.core.url_to_fs(url)
                 stored = files.open(inside, cache_type="blockcache", block_size=BLOCK)
+            if request.no_external:
+                require_alone(shown, stored)
             dataset = xr.open_dataset(stored, engine="h5netcdf", phony_dims="sort", **wishes)
 
     def reader(array: Any) -> Read:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.file_series import MAX_AXIS, Request, Stamp, library, naming
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.stored_bytes import (
@@ -72,7 +73,8 @@ class Blocks:
         covered = np.zeros(places, np.int32)
         ends = zip(self._low.T, self._high.T, edges, strict=True)
         cuts = [(np.searchsorted(e, low), np.searchsorted(e, high)) for low, high, e in ends]
-        for number in range(len(firsts)):
+        filled = np.prod([high - low for low, high in cuts], axis=0, dtype=np.float64).sum()
+        for number in range(len(firsts) if filled == prod(places) else 0):
             covered[tuple(slice(low[number], high[number]) for low, high in cuts)] += 1
         if (covered != 1).any():
             raise InputError("its blocks overlap, or leave cells of their grid out")
@@ -202,6 +204,17 @@ def athena_variables(
     return in_place_of(variables, placed(found, coords))
 
 
+def warn_of_system(source: str, system: str) -> None:
+    """Warn (FhashWarning) of coordinates that are not Cartesian, such as "spherical_polar"."""
+    if system not in ("", "0", "cartesian"):
+        warnings.warn(
+            f"{source}: its coordinates are {system}; x, y and z are their numbers in the order of"
+            " the file, not positions in space",
+            FhashWarning,
+            stacklevel=2,
+        )
+
+
 LEAF = 1
 """Type of a block of FLASH that no finer ones replace."""
 
@@ -274,6 +287,8 @@ def open_plotfile(path: Path, request: Request) -> Source:
         _require_one_level(int(finest) + 1)
         axes = "xyz"[: int(dim)]
         rest = lines[5 + count :]
+        system = rest[6].strip()
+        warn_of_system(str(path), {"1": "cylindrical", "2": "spherical"}.get(system, system))
         low, high = (numbers_of(rest[n], len(axes)) for n in (0, 1))
         boxes = int(rest[8].split()[1])
         cells = _within(path, f"{rest[10 + boxes * len(axes)].strip()}_H")

@@ -443,33 +443,10 @@ def require_inside(path: Path, seen: set[Path] | None = None) -> None:
     import h5py
 
     seen = {path.resolve()} if seen is None else seen
-    named: dict[str, None] = {}
     with hdf5_file(path) as file:
-        groups, known = [file["/"].id], set()
-        while groups:
-            group = groups.pop()
-            info = h5py.h5o.get_info(group)
-            if info.addr in known:
-                continue
-            known.add(info.addr)
-            for name in list(group):
-                kind = group.links.get_info(name).type
-                if kind == h5py.h5l.TYPE_EXTERNAL:
-                    named[text_of(group.links.get_val(name)[0])] = None
-                if kind != h5py.h5l.TYPE_HARD:
-                    continue
-                opened = h5py.h5o.open(group, name)
-                if isinstance(opened, h5py.h5g.GroupID):
-                    groups.append(opened)
-                elif isinstance(opened, h5py.h5d.DatasetID):
-                    dataset = h5py.Dataset(opened)
-                    named |= {text_of(each[0]): None for each in dataset.external or ()}
-                    if dataset.is_virtual:
-                        named |= {each.file_name: None for each in dataset.virtual_sources()}
-        named.pop(".", None)
         places = {
             each: candidates(file["/"], each) + candidates(file["/"], each, raw=True)
-            for each in named
+            for each in _named_files(file)
         }
     for name, found in places.items():
         inside_folder(path, path.parent / name)
@@ -480,6 +457,51 @@ def require_inside(path: Path, seen: set[Path] | None = None) -> None:
             if place.resolve() not in seen and place.is_file() and h5py.is_hdf5(place):
                 seen.add(place.resolve())
                 require_inside(place, seen)
+
+
+def require_alone(source: str, stored: Any) -> None:
+    """Raise InputError if an HDF5 file elsewhere refers to any other one: HDF5 would look here.
+
+    stored: the open file, whose place is kept.
+    """
+    import h5py
+
+    with h5py.File(stored, "r") as file:
+        for name in _named_files(file):
+            raise InputError(
+                f"{source} refers to {name[:80]}, a file of this machine; without --no-external"
+                " (no_external=True) it is read"
+            )
+
+
+def _named_files(file: Any) -> list[str]:
+    """Names of the files that links, raw and virtual datasets of an HDF5 file draw on."""
+    import h5py
+
+    named: dict[str, None] = {}
+    groups, known = [file["/"].id], set()
+    while groups:
+        group = groups.pop()
+        info = h5py.h5o.get_info(group)
+        if info.addr in known:
+            continue
+        known.add(info.addr)
+        for name in list(group):
+            kind = group.links.get_info(name).type
+            if kind == h5py.h5l.TYPE_EXTERNAL:
+                named[text_of(group.links.get_val(name)[0])] = None
+            if kind != h5py.h5l.TYPE_HARD:
+                continue
+            opened = h5py.h5o.open(group, name)
+            if isinstance(opened, h5py.h5g.GroupID):
+                groups.append(opened)
+            elif isinstance(opened, h5py.h5d.DatasetID):
+                dataset = h5py.Dataset(opened)
+                named |= {text_of(each[0]): None for each in dataset.external or ()}
+                if dataset.is_virtual:
+                    named |= {each.file_name: None for each in dataset.virtual_sources()}
+    named.pop(".", None)
+    return list(named)
 
 
 def _numbered_name(text: str, number: int) -> str:

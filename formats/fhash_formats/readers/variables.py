@@ -17,7 +17,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.file_series import Stamp
 from fhash_formats.readers.layout import Read
 from fhash_formats.readers.stored_parts import StoredParts
-from fhash_formats.series import AXIS_NAMES, Coordinate, meant
+from fhash_formats.series import AXIS_NAMES, MAX_NAME, Coordinate, meant
 from fhash_formats.support.values import json_attributes, text_of
 
 MAX_LISTED = 12
@@ -25,6 +25,8 @@ MAX_LISTED = 12
 
 MADE_UP = "phony_dim_"
 """Beginning of the names that h5netcdf makes up for dimensions without one."""
+MAX_WHOLE = 1 << 26
+"""Values of an array beside others that is read at once, such as positions and tables."""
 MAX_LETTERS = 64
 """Letters of a date, or of a label."""
 
@@ -182,7 +184,9 @@ class Variable:
         return np.array([b"".join(row) for row in rows])
 
     def whole(self) -> npt.NDArray[Any]:
-        """All stored values."""
+        """All stored values; raises InputError for more than are read at once."""
+        if prod(self.shape) > MAX_WHOLE:
+            raise InputError(f"{self.name} has {prod(self.shape)} values; {MAX_WHOLE} are possible")
         return np.asarray(self.read((slice(None),) * len(self.shape)))
 
     def __str__(self) -> str:
@@ -417,7 +421,7 @@ def _step_path(path: str) -> _StepPath | None:
     """The part of a path that counts steps, None without one; the array's own name is none."""
     parts = path.split("/")
     for depth, part in enumerate(parts[:-1]):
-        match = NUMBERED.fullmatch(part)
+        match = NUMBERED.fullmatch(part) if len(part) <= MAX_NAME else None
         if match is None:
             continue
         word = match["word"].strip().lower()

@@ -70,8 +70,8 @@ MARCH_OF_YEAR_0_JULIAN = 1_721_118
 LARGEST_YEAR = 10**6
 """Years beyond it are no dates."""
 
-SINCE = re.compile(r"\s*(\S+)\s+since\s+(\S.*?)\s*", re.IGNORECASE)
-"""Units of a time that is counted since something."""
+SINCE = re.compile(r"\s*(\S+)\s+since\s+(\S|\S.*\S)\s*", re.IGNORECASE)
+"""Units of a time that is counted since something; the work is in proportion to the length."""
 
 NUMERIC = re.compile(
     r"\s*(?:\w+\s+as\s+)?(?:%Y(?P<month>%m(?P<day>%d)?)?|(?i:YYYY(?P<mm>MM(?P<dd>DD)?)?))"
@@ -150,7 +150,8 @@ def clock(attributes: Mapping[str, Any]) -> Clock | None:
     None where they name no date, as "s", "months since ..." or a calendar that is not known.
     """
     match = re.fullmatch(
-        r"\s*([A-Za-zµ_]+)\s+(?:since|after|from|ref)\s+(.+?)\s*", str(attributes.get("units", ""))
+        r"\s*([A-Za-zµ_]+)\s+(?:since|after|from|ref)\s+(\S|\S.*\S)\s*",
+        str(attributes.get("units", "")),
     )
     calendar = CALENDARS.get(str(attributes.get("calendar") or "standard").strip().lower())
     if match is None or calendar is None:

@@ -178,6 +178,12 @@ def test_the_origin_of_imod(tmp_path: Path, flags: int, version: int, first: flo
         assert series.coords["x"].values[0] == first
 
 
+def test_cells_of_other_angles_are_told(tmp_path: Path) -> None:
+    path = mrc(tmp_path / "a.mrc", np.zeros((2, 2, 2), "u1"), at52=90.0, at56=105.0, at60=90.0)
+    with pytest.warns(FhashWarning, match="angles 90, 105, 90"):
+        open_series(path).close()
+
+
 def netcdf(path: Path, values: np.ndarray, **attributes: Any) -> Path:
     with h5py.File(path, "w") as file:
         file["v"] = values

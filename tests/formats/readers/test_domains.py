@@ -234,6 +234,17 @@ def plotfile(path: Path, time: float = 0.25, *, kind: str = "<f8", ghosts: int =
     (path / "Header").write_text("\n".join([*lines, *edges, "Level_0/Cell"]) + "\n")
 
 
+def test_coordinates_that_are_not_cartesian_are_told(tmp_path: Path) -> None:
+    athena(tmp_path / "a.athdf", Coordinates=np.bytes_("spherical_polar"))
+    with pytest.warns(FhashWarning, match="coordinates are spherical_polar"):
+        open_series(tmp_path / "a.athdf", var="rho").close()
+    plotfile(tmp_path / "plt")
+    header = tmp_path / "plt" / "Header"
+    header.write_text(header.read_text().replace("0.5 0.5 0.5 \n0\n", "0.5 0.5 0.5 \n1\n"))
+    with pytest.warns(FhashWarning, match="coordinates are cylindrical"):
+        open_series(tmp_path / "plt", var="density").close()
+
+
 @pytest.mark.parametrize("kind", ["<f8", "<f4", ">f8"])
 @pytest.mark.parametrize("ghosts", [0, 2])
 def test_plotfiles_of_amrex(tmp_path: Path, kind: str, ghosts: int) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
+import time
 import warnings
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import h5py
 import nibabel
 import numpy as np
@@ -17,8 +19,13 @@ import tifffile
 import zarr
 
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.cf import role_of_name
+from fhash_formats.readers.images import quoted, vectors
 from fhash_formats.readers.registry import list_variables, open_series
+from fhash_formats.readers.simulations import Blocks
 from fhash_formats.readers.stored_bytes import numbers_in_text
+from fhash_formats.readers.variables import Variable, join
+from fhash_formats.support.dates import clock, in_days
 
 SOURCES = Path(__file__).parents[2] / "hard" / "fuzz" / "sources"
 """Sound files of each format that this project reads itself."""
@@ -178,6 +185,59 @@ def test_no_reader_leaves_the_folder_of_its_file(tmp_path: Path, write: Any) -> 
     open_series(place, **wishes).close()
     with pytest.raises(InputError, match="outside its folder"):
         open_series(place, no_external=True, **wishes)
+
+
+def test_hdf5_at_a_url_reads_no_file_of_this_machine(tmp_path: Path) -> None:
+    """HDF5 opens raw files by their names, wherever the file itself is."""
+    (tmp_path / "secret.raw").write_bytes(NUMBERS.tobytes())
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        external = [(str(tmp_path / "secret.raw"), 0, NUMBERS.nbytes)]
+        file.create_dataset("v", NUMBERS.shape, "f4", external=external)
+    with fsspec.open("memory://a.h5", "wb") as written:
+        written.write((tmp_path / "a.h5").read_bytes())
+    with open_series("memory://a.h5") as series:
+        np.testing.assert_array_equal(series.read(0), NUMBERS)
+    with pytest.raises(InputError, match=r"refers to .*secret\.raw, a file of this machine"):
+        open_series("memory://a.h5", no_external=True)
+
+
+def test_tables_and_positions_are_bounded(tmp_path: Path) -> None:
+    """Nobody wrote them, so that a file of 3 kB promises 8 GiB."""
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file.create_dataset("v", (1 << 30, 1, 1, 1), "f4", chunks=(1 << 20, 1, 1, 1))
+        file.create_dataset("time", (1 << 30,), "f8", chunks=(1 << 20,))
+        file["time"].make_scale("time")
+        file["v"].dims[0].attach_scale(file["time"])
+    with pytest.raises(InputError, match=r"1073741824 .*possible"):
+        open_series(tmp_path / "a.nc")
+
+
+def test_the_work_on_a_text_grows_with_its_length() -> None:
+    """Each took seconds for a header of 64 kB, or minutes."""
+    many, start = 60_000, time.process_time()
+    assert clock({"units": f"days since 2000{' ' * many}x"}) is None
+    assert in_days([0], {"units": f"months since 2000{' ' * many}x"}) is None
+    assert role_of_name("1" * many + "x") is None
+    assert join(
+        [Variable(name="_" * many + "/v", shape=(2, 2), dtype=np.dtype("f4"))], lambda path: {}
+    )
+    assert quoted('"' + '\\"' * many) == []
+    with pytest.raises(InputError):
+        vectors("( " * many)
+    assert time.process_time() - start < 1
+
+
+def test_labels_of_nrrd() -> None:
+    assert quoted('"a" "b c" "" "d\\"e" "f\\\\"') == ["a", "b c", "", 'd\\"e', "f\\\\"]
+    assert quoted("none") == []
+
+
+def test_nested_blocks_are_refused_at_once() -> None:
+    """The time did not grow with their number alone, but with its square."""
+    many = 1 << 20
+    firsts = np.zeros((many, 1), np.int64)
+    with pytest.raises(InputError, match="overlap"):
+        Blocks(firsts, np.arange(1, many + 1)[:, None])
 
 
 def test_numbers_in_text_are_read_in_parts(tmp_path: Path) -> None:
