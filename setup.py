@@ -300,7 +300,8 @@ def native(
     `flags` and `link_flags` are added to those of every library, where the compiler is GCC or
     Clang.
     """
-    headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp"), *FORMATS.glob("*.h")}
+    headers = {*folder.glob("*.hpp"), *folder.glob("files/*.cpp"), *FORMATS.glob("*.hpp")}
+    headers |= {*FORMATS.glob("*.h")}
     others = sorted((folder / "third_party").glob("**/*.c"))
     return Extension(
         name,

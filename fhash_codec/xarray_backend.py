@@ -542,7 +542,8 @@ class Shown:
         packing = self.packing()
         if packing and figures.get(MAX_ERROR):
             figures[MAX_ERROR] = max(figures[MAX_ERROR], self.packed_error(packing))
-        return without_figures(found) | figures
+        # where the file has none of its own, its tiles were taken over with those of the store
+        return (without_figures(found) if figures else found) | figures
 
 
 def _invented(volume: Volume) -> dict[str, str]:

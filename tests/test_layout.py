@@ -4,6 +4,7 @@ what exists. `test_rooms.py` holds the order of the rooms."""
 from __future__ import annotations
 
 import ast
+import importlib
 import importlib.metadata
 import re
 import shlex
@@ -204,3 +205,22 @@ def test_readme_commands_exist(line: str) -> None:
     words = shlex.split(line.split("|")[0].split(">")[0], comments=True)[1:]
     result = CliRunner().invoke(program, [*words, "--help"])
     assert result.exit_code == 0, result.stderr
+
+
+SECURITY = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
+LIMITS = re.findall(
+    r"^\| (.+) \| ([0-9^]+)(?: (\w+))? \| `(.+)\.(\w+)` \|$", SECURITY, re.MULTILINE
+)
+UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+
+
+@pytest.mark.parametrize("row", LIMITS, ids=lambda row: row[0])
+def test_limits_of_the_document_are_those_of_the_program(row: tuple[str, ...]) -> None:
+    _, number, unit, module, name = row
+    base, _, power = number.partition("^")
+    limit = int(base) ** int(power or 1) * UNITS.get(unit, 1)
+    assert getattr(importlib.import_module(module), name) == limit
+
+
+def test_every_limit_is_looked_at() -> None:
+    assert len(LIMITS) == SECURITY.count("` |\n") > 12

@@ -55,7 +55,7 @@ FILES = {
     **dict.fromkeys(("plan", "merge", "append"), "parts"),
     **dict.fromkeys(("pack", "unpack", "export", "serve"), "zarr"),
     **dict.fromkeys(("verify", "diff"), "checks"),
-    **dict.fromkeys(("view", "hdf5-plugin-path", "paraview"), "view"),
+    **dict.fromkeys(("view", "hdf5-plugin-path", "paraview", "completion"), "view"),
 }
 """Modules of the commands that share one; any other command has one of its own name."""
 

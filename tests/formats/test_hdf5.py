@@ -323,7 +323,7 @@ def test_a_program_with_hdf5_linked_into_it_says_why_it_cannot_write(tmp_path: P
 
 @pytest.mark.parametrize("before", [None, "", "/a/folder"])
 def test_libraries_loaded_later_find_the_plugin(before: str | None) -> None:
-    """That of netCDF4 has an HDF5 of its own, which reads the variable when it is loaded."""
+    """The HDF5 of netCDF4 reads the variable when it is loaded."""
     script = "import os, fhash_formats.hdf5; print(os.environ['HDF5_PLUGIN_PATH'])"
     variables = {**os.environ, **({} if before is None else {"HDF5_PLUGIN_PATH": before})}
     if before is None:

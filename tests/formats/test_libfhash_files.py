@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 import numpy.typing as npt
 import pytest
-from rounding import rounding
+from reference import rounding
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume, encoding

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray
 import zarr
-from rounding import rounding
+from reference import rounding
 from zarr.storage import ZipStore
 
 import fhash_codec

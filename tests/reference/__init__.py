@@ -10,3 +10,22 @@ the product with it bit for bit. Read it in this order:
 5. head.py: the trained correction.
 6. masks.py, labels.py, predictor.py: the other kinds of tiles.
 """
+
+from __future__ import annotations
+
+import numpy as np
+
+import fhash_codec
+from fhash_codec.paper.model import PaperModel
+
+
+def rounding(volume: fhash_codec.Volume) -> float:
+    """The largest difference of two readers of a file, in data units.
+
+    It is 0 but for networks, whose sums have any order.
+    """
+    if not isinstance(volume._model, PaperModel):
+        return 0.0
+    low, high = volume.value_range.floats
+    spacing = np.spacing(volume.float_dtype.type(max(abs(low), abs(high))))
+    return volume._model.network.rounding() * (high - low) + float(spacing)

@@ -1,4 +1,4 @@
-"""Containers in the browser (`fhash view`), ParaView and HDF5's tools."""
+"""Containers in the browser (`fhash view`), ParaView and HDF5's tools; completion of the shell."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Annotated, TypedDict
 from xml.sax.saxutils import quoteattr
 
 import click
+from click.shell_completion import get_completion_class
 
 from fhash_cli.options import BaseCommand, force_option, json_option
 from fhash_cli.output import emit, one_line, say, size, table
@@ -21,6 +22,8 @@ from fhash_formats.native import FOLDER
 
 PORT = 8643
 """Port unless another is asked for."""
+SHELLS = ("bash", "zsh", "fish")
+"""Shells that click writes code for."""
 
 
 class Shown(TypedDict):
@@ -170,3 +173,25 @@ def paraview_command(files: tuple[Path, ...]) -> None:
             "PYTHONPATH": os.pathsep.join(paths),
         }
         sys.exit(subprocess.run([program, *map(str, files)], env=environment).returncode)
+
+
+@click.command("completion", cls=BaseCommand, epilog='eval "$(fhash completion bash)"')
+@click.argument("shell", metavar="SHELL", type=click.Choice(SHELLS))
+@click.pass_context
+def completion_command(context: click.Context, shell: str) -> None:
+    """Print code for SHELL that completes commands, options and file names on Tab.
+
+    \b
+    Put into the start-up file of the shell:
+      bash   eval "$(fhash completion bash)"
+      zsh    eval "$(fhash completion zsh)"
+      fish   fhash completion fish | source
+    """
+    kind = get_completion_class(shell)
+    if kind is None:
+        raise click.UsageError(f"click writes no completion for {shell}")
+    if sys.stdout is None:
+        raise OutputError("the code cannot be printed, stdout is closed")
+    program = context.find_root()
+    code = kind(program.command, {}, "fhash", "_FHASH_COMPLETE").source()
+    click.echo(code)

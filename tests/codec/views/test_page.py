@@ -29,7 +29,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
-from rounding import rounding
+from reference import rounding
 
 import fhash_codec
 from fhash_cli.main import program

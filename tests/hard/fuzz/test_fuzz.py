@@ -32,7 +32,8 @@ EVERY = 1 if LONG else 7
 seeds of one setup (2 and 15), so that all kinds of seeds take turns."""
 NOT_FUZZED = {
     **dict.fromkeys(("fhash_abi_version", "fhash_codec_abi_version"), "takes nothing"),
-    **dict.fromkeys(("fhash_network_abi_version",), "takes nothing"),
+    "fhash_network_abi_version": "takes nothing",
+    "fhash_function": "takes a name of the caller",
     **dict.fromkeys(("fhash_network_fma", "fhash_network_copy"), "for benchmarks alone"),
     **dict.fromkeys(
         ("fhash_bricks_work", "fhash_bricks_gaps", "fhash_bricks_touch", "fhash_bricks_run"),
