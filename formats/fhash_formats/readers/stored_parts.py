@@ -469,7 +469,7 @@ def require_alone(source: str, stored: Any) -> None:
     with h5py.File(stored, "r") as file:
         for name in _named_files(file):
             raise InputError(
-                f"{source} refers to {name[:256]}, a file of this machine; without --no-external"
+                f"{source} refers to {name[:1024]}, a file of this machine; without --no-external"
                 " (no_external=True) it is read"
             )
 
