@@ -176,6 +176,7 @@ def encode_variable(
         network = encode_paper(writer, series, config, mask, path, progress, measured.complete)
         header, checkpoint = network.header, network.checkpoint
         advice, rounding = network.advice, network.rounding
+    series.check()  # what was scanned, coded and measured is of one state
     figures = measured.figures(header)
     return EncodedVariable(
         header=header,

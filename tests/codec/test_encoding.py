@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -440,3 +441,20 @@ def test_integers_that_missing_values_round_promise_no_bound(tmp_path) -> None:
         fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(max_error=0.0))
     with pytest.warns(FhashWarning, match="rounded, by up to 128"):
         fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=30.0))
+
+
+def test_a_store_that_changes_after_the_scan_is_named(tmp_path: Path) -> None:
+    """Chunks are looked at once more when all is coded: no file mixes two states."""
+    store, run = tmp_path / "a.zarr", tmp_path / "a.fhz"
+    xarray.DataArray(values(0), dims=("t", "z", "y", "x"), name="u").to_zarr(
+        store, consolidated=False
+    )
+    chunk = next(path for path in sorted((store / "u" / "c").rglob("*")) if path.is_file())
+
+    def progress(stage: str, done: int, total: int, note: str) -> None:
+        if stage != "scanning":
+            os.utime(chunk, ns=(1, 1))
+
+    with pytest.raises(InputError, match="changed while it was being read"):
+        fhash_codec.encode(store, run, QUICK, progress=progress)
+    assert not run.exists()

@@ -9,7 +9,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -274,9 +274,18 @@ class Stamp:
         found = os.stat(path)
         return found.st_size, (found.st_mtime_ns, found.st_ino), 0
 
+    def again(self) -> Self:
+        """The stamp of what is there now. Raises OSError."""
+        return type(self)(self.path, *self._look(self.path))
+
     def check(self) -> None:
         """Raise InputError if anything has changed, so that frames of two states never mix."""
-        now = self.of(self.path)
+        try:
+            now = self.again()
+        except FileNotFoundError:
+            raise InputError(f"{self.path} was removed while it was being read") from None
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be read: {condense(error)}") from error
         if now == self:
             return
         told = "same size, written again"
@@ -317,6 +326,33 @@ class FolderStamp(Stamp):
         return size, digest.digest(), files
 
 
+STATE = ("etag", "e_tag", "lastmodified", "last_modified", "mtime", "created", "version")
+"""What servers and stores tell of a state beside the size, as fsspec and obstore name it."""
+
+
+@dataclass(frozen=True)
+class UrlStamp(Stamp):
+    """State of a file at a URL, as far as its server tells it.
+
+    Each look is a request, so `Series.check` alone uses it.
+
+    Attributes:
+        ask: gives the server's answer as a mapping, as `info` of fsspec does.
+    """
+
+    ask: Callable[[], Mapping[str, Any]] = field(default=dict, compare=False)
+
+    @classmethod
+    def at(cls, url: str, ask: Callable[[], Mapping[str, Any]]) -> Self:
+        """The stamp of a file. Raises OSError, or what the library of the store raises."""
+        told = {key.lower(): value for key, value in ask().items()}
+        state = tuple(str(told.get(key)) for key in STATE)
+        return cls(Path(url), int(told.get("size") or 0), state, ask=ask)
+
+    def again(self) -> Self:
+        return self.at(str(self.path), self.ask)
+
+
 SLAB_BYTES = 64 * 2**20
 """Bytes of a file that are kept between frames, at most.
 
@@ -351,7 +387,7 @@ class Stored:
         source: name for messages, that of the first file.
         stamp: checked before and after every fetch; None for values in memory.
         beside: further files that hold values, checked likewise.
-        folder: stamp of all files, which `FileSeries.check` alone looks at.
+        slow: stamp that takes long, of a folder or at a URL: `FileSeries.check` alone looks at it.
         close: lets go of all that is open.
         shape, axes: lengths and axes of the dimensions, in the file's order.
         dtype: type of the physical values, in any byte order.
@@ -368,7 +404,7 @@ class Stored:
     source: str
     stamp: Stamp | None
     beside: Sequence[Path]
-    folder: FolderStamp | None
+    slow: Stamp | None
     close: Callable[[], None]
     shape: Sequence[int]
     axes: Sequence[str]
@@ -415,7 +451,7 @@ class FileSeries(Series):
         self._axes, self._fetch, self._close = tuple(stored.axes), stored.fetch, stored.close
         opened = () if stored.stamp is None else (stored.stamp,)
         self._quick = (*opened, *map(Stamp.of, stored.beside))
-        self.stamps = self._quick if stored.folder is None else (*self._quick, stored.folder)
+        self.stamps = self._quick if stored.slow is None else (*self._quick, stored.slow)
         most = max(1, SLAB_BYTES // (self.dtype.itemsize * prod(self.shape[1:])))
         self._starts = _slabs(_steps_of_chunks(self._axes, stored.shape, stored.chunks), most)
         self._held_slab: tuple[int, npt.NDArray[Any]] | None = None
@@ -517,8 +553,12 @@ class FileSeries(Series):
         ranges = {axis: slice(0, length) for axis, length in expected.items()}
         ranges["t"] = slice(start, stop)
         self._check_files()
-        with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
-            values = self._fetch(tuple(ranges[axis] for axis in self._axes))
+        try:
+            with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
+                values = self._fetch(tuple(ranges[axis] for axis in self._axes))
+        except InputError:
+            self.check()  # a part that was cut or written again tells nothing of that
+            raise
         self._check_files()
         if values.shape != tuple(expected[axis] for axis in self._axes):
             raise InputError(

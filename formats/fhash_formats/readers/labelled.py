@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from fhash_formats.readers.file_series import (
     FileSeries,
     Request,
     Stamp,
+    UrlStamp,
     condense,
     library,
     naming,
@@ -356,6 +358,14 @@ def is_data_url(place: object) -> bool:
     return is_url(place) and Path(file_name(str(place))).suffix.lower() in DATA_SUFFIXES
 
 
+def _told(files: Any, inside: str) -> Mapping[str, Any]:
+    """What a store tells of a file now, and not what it told before."""
+    if hasattr(files, "invalidate_cache"):
+        files.invalidate_cache(inside)
+    found: Mapping[str, Any] = files.info(inside)
+    return found
+
+
 def open_url(url: str, request: Request) -> Source:
     """A Zarr store, or a file of NetCDF-4 or HDF5, elsewhere; values are fetched as they are read.
 
@@ -370,7 +380,7 @@ def open_url(url: str, request: Request) -> Source:
         )
     xr = library(url, "a URL", "xarray", "fhash[remote]")
     wishes = {"decode_cf": False, "cache": False, "chunks": None}
-    place, shown = url.split("?")[0].rstrip("/"), without_secrets(url)
+    place, shown, slow = url.split("?")[0].rstrip("/"), without_secrets(url), None
     suffix = Path(file_name(url)).suffix.lower()
     fsspec = library(url, "a URL", "fsspec", "fhash[remote]")
     files = object_store(url)
@@ -385,10 +395,11 @@ def open_url(url: str, request: Request) -> Source:
         else:
             # blocks, since HDF5 reads few bytes here and there
             if files is not None:
-                stored = files.open(place, buffer_size=BLOCK)
+                inside, stored = place, files.open(place, buffer_size=BLOCK)
             else:
                 files, inside = fsspec.core.url_to_fs(url)
                 stored = files.open(inside, cache_type="blockcache", block_size=BLOCK)
+            slow = UrlStamp.at(shown, partial(_told, files, inside))
             if request.no_external:
                 require_alone(shown, stored)
             dataset = xr.open_dataset(stored, engine="h5netcdf", phony_dims="sort", **wishes)
@@ -416,6 +427,7 @@ def open_url(url: str, request: Request) -> Source:
         variables=variables,
         groups={"": dataset.attrs},
         close=dataset.close,
+        slow=slow,
         naming=True,
         default_fill=default_fill if suffix in NETCDF_SUFFIXES else lambda dtype: None,
     )

@@ -552,7 +552,7 @@ class Selection:
         stored = Stored(
             source=self.source,
             stamp=(None if variable.members else behind[0].stamp) or opened.stamp,
-            folder=None if folder is None else FolderStamp.of(folder),
+            slow=opened.slow if folder is None else FolderStamp.of(folder),
             close=opened.close,
             beside=[*opened.files, *dict.fromkeys(n for each in behind for n in each.files)],
             shape=layout.shape,

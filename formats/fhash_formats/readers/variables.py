@@ -569,6 +569,7 @@ class Source:
         close: lets go of all that is open.
         stamp: of the file, or of what says the shapes.
         folder: that holds all of the source; None for a file.
+        slow: stamp of a file at a URL.
         files: further files that hold values.
         naming: whether dimensions have names by which positions and all else are found, as in
             NetCDF. Elsewhere names of coordinates count, and nothing is kept but what is beside.
@@ -588,6 +589,7 @@ class Source:
     close: Callable[[], None] = lambda: None
     stamp: Stamp | None = None
     folder: Path | None = None
+    slow: Stamp | None = None
     files: Sequence[Path] = ()
     naming: bool = False
     spread: bool = False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 import re
 import shutil
 import time
@@ -13,6 +15,7 @@ import fsspec
 import h5py
 import nibabel
 import numpy as np
+import numpy.typing as npt
 import pytest
 import segyio
 import tifffile
@@ -254,3 +257,35 @@ def test_numbers_in_text_are_read_in_parts(tmp_path: Path) -> None:
             file.seek(0)
             with pytest.raises(InputError, match="120000 numbers"):
                 numbers_in_text(file, size, np.dtype("f8"), count)
+
+
+def test_a_file_at_a_url_that_changes_is_named() -> None:
+    """The server tells its state; nothing else changes it."""
+
+    def put(values: npt.NDArray[Any]) -> None:
+        data = io.BytesIO()
+        with h5py.File(data, "w") as file:
+            file.create_dataset("v", data=values)
+        with fsspec.open("memory://changing.h5", "wb") as written:
+            written.write(data.getvalue())
+
+    put(NUMBERS)
+    with open_series("memory://changing.h5") as series:
+        series.read(0)
+        series.check()
+        put(NUMBERS + 1)
+        with pytest.raises(InputError, match=r"changing\.h5 changed while it was being read"):
+            series.check()
+
+
+def test_a_chunk_that_was_cut_is_a_change_and_no_damage(tmp_path: Path) -> None:
+    array = zarr.create_array(
+        tmp_path / "a.zarr", shape=(3, 2, 40, 40), chunks=(1, 2, 40, 40), dtype="f4"
+    )
+    array[...] = np.random.default_rng(0).normal(size=array.shape)
+    with open_series(tmp_path / "a.zarr") as series:
+        series.read(0)
+        os.truncate(tmp_path / "a.zarr" / "c" / "2" / "0" / "0" / "0", 99)
+        series.read(1)
+        with pytest.raises(InputError, match="changed while it was being read"):
+            series.read(2)
