@@ -124,7 +124,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
             for name in MARCH
         ]
         jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}", declared))]
-    jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing)) for name in SOURCES]
+    jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in SOURCES]
     jobs += [
         (path, ("-xc", "-std=gnu11", "-w", "-DZSTD_DISABLE_ASM=1", "-fsanitize=address", "-g"))
         for name in (LIBRARIES if SOURCES else ())
