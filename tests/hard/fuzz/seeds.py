@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from reference.kernels import (
     Table,
-    blank_state,
+    blank_predicted_state,
     encode_integers,
     encode_labels,
     encode_mask,
@@ -123,7 +123,12 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             data = np.ascontiguousarray(array).tobytes()
             file.write(struct.pack("<q", len(data)) + data)
 
-        for state in (prior_state(False), prior_state(True), mask_prior_state(), blank_state()):
+        for state in (
+            prior_state(False),
+            prior_state(True),
+            mask_prior_state(),
+            blank_predicted_state(),
+        ):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         for array in (fast_prior().slots, fast_prior().defaults, fast_prior().lookup):
