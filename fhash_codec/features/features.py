@@ -172,6 +172,12 @@ class Mask(Feature):
             )
         return np.isfinite(frame) & mask
 
+    def check(self) -> None:
+        """Raise InputError if the file has changed since it was opened."""
+        check = getattr(self.read, "check", None)  # a mask in memory has none
+        if check is not None:
+            check()
+
     def __str__(self) -> str:
         return f"mask:{self.path}"
 
@@ -548,6 +554,9 @@ def find_extent(
         if ranks is not None:
             ranks.add(frames[mask])
         progress("selecting", len(packed), len(key_frames), "")
+    for feature in features:
+        if isinstance(feature, Mask):
+            feature.check()
     box = fuse(boxes)
     if box is None:
         low, high = scan.value_range.low, scan.value_range.high

@@ -64,7 +64,8 @@ def mask_files(config: EncodeConfig) -> list[str]:
 
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
     """The feature of a mask in memory; raises InputError for a shape other than the series'."""
-    values = as_array(mask, "mask").astype(bool)
+    given = as_array(mask, "mask")
+    values = (given != 0) & (given == given)  # as in a file: neither zero nor NaN
     if values.shape not in (series.shape, series.shape[1:]):
         raise InputError(
             f"mask has shape {values.shape}; the series has {series.shape} in (t, z, y, x)"

@@ -179,9 +179,9 @@ def eager_checkpoints() -> None:
     """Let a training save its checkpoint as often as it can."""
     import functools
 
-    from fhash_codec.paper import train
+    from fhash_codec.paper import fit
 
-    train.Breaks = functools.partial(train.Breaks, save_seconds=0.0)  # type: ignore
+    fit.Breaks = functools.partial(fit.Breaks, save_seconds=0.0)  # type: ignore
 
 
 def change_at(stage: str, done: int, path: str, how: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import random
+import re
 import shutil
 import signal
 import tempfile
@@ -173,7 +174,7 @@ def check(bench: Bench, folder: Path, form: str, profile: str, stage: str, how: 
     )
     assert ended.code == 2, (what, ended.output)
     assert ended.line.startswith("fhash: error: "), what
-    assert "changed while it was being read" in ended.line or "cannot be read" in ended.line, (
+    assert re.search("(changed|removed) while it was being read|cannot be read", ended.line), (
         what,
         ended.line,
     )
@@ -334,8 +335,8 @@ PLACES = [
     ("encode compact", "fhash_codec.compact.encode", "code"),
     ("encode compact", "fhash_codec.encoding", "measure"),
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),
-    ("encode paper", "fhash_codec.paper.train", "load_checkpoint"),
-    ("encode paper", "fhash_codec.paper.train", "train"),
+    ("encode paper", "fhash_codec.paper.fit", "load_checkpoint"),
+    ("encode paper", "fhash_codec.paper.fit", "train"),
     ("encode paper", "fhash_codec.paper.encode", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read_steps"),
     ("decode h5", "fhash_formats.writers.labelled", "_create_hdf5"),

@@ -370,6 +370,10 @@ class Mask:
         mask: npt.NDArray[np.bool_] = frame != 0
         return mask & ~np.isnan(frame) if frame.dtype.kind == "f" else mask
 
+    def check(self) -> None:
+        """Raise InputError if the file has changed since it was opened."""
+        self._values.check()
+
     def close(self) -> None:
         """Close the file."""
         self._values.close()
