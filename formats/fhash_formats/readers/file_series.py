@@ -327,7 +327,7 @@ class FolderStamp(Stamp):
 
 
 STATE = ("etag", "e_tag", "lastmodified", "last_modified", "mtime", "created", "version")
-"""What servers and stores tell of a state beside the size, as fsspec and obstore name it."""
+"""Keys of the state beside the size, as fsspec and obstore name what servers and stores say."""
 
 
 @dataclass(frozen=True)

@@ -359,7 +359,7 @@ def is_data_url(place: object) -> bool:
 
 
 def _told(files: Any, inside: str) -> Mapping[str, Any]:
-    """What a store tells of a file now, and not what it told before."""
+    """The answer of a store about a file now, not a cached one."""
     if hasattr(files, "invalidate_cache"):
         files.invalidate_cache(inside)
     found: Mapping[str, Any] = files.info(inside)
