@@ -37,7 +37,7 @@ WAITS = 8
 WAITS_WITH_SURFACES = 14
 """Waits that a pass may take with surfaces, whose search ends when all of a pass are found."""
 FRAMES = ("plain", "surfaces", "maximum", "graded", "all light")
-NETWORKS = (*("plain", "between", "graded", "surfaces", "attenuated", "unskipped", "central"),)
+NETWORKS = ("plain", "between", "graded", "surfaces", "attenuated", "unskipped", "central")
 
 
 def assert_a_pass_waits_little(planned: Planned, path: Path, scene: dict[str, Any]) -> None:
