@@ -554,9 +554,9 @@ def find_extent(
         if ranks is not None:
             ranks.add(frames[mask])
         progress("selecting", len(packed), len(key_frames), "")
-    for feature in features:
-        if isinstance(feature, Mask):
-            feature.check()
+    for each in features:
+        if isinstance(each, Mask):
+            each.check()
     box = fuse(boxes)
     if box is None:
         low, high = scan.value_range.low, scan.value_range.high

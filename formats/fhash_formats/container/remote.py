@@ -285,7 +285,7 @@ class FsspecFile:
             raise InputError(f"{name}: its server does not say its size; download it first")
         self.size: int = info["size"]
         self._partial = info.get("partial", True)
-        self._stamp = _stamp(info)
+        self._stamp = state_of(info)
         self._conditions = _conditions(info) if self._http else {}
         self._gave_parts = False
         self._end: bytes | None = None
@@ -341,7 +341,7 @@ class FsspecFile:
     def changed(self) -> bool:
         """Whether another file is there now, or none; False where that cannot be known."""
         try:
-            return _stamp(self._info()) != self._stamp
+            return state_of(self._info()) != self._stamp
         except FileNotFoundError as error:
             return not _may_pass(error)
         except Exception:
@@ -440,7 +440,7 @@ class FsspecFile:
                 return
             asked = next(self._clock)
             if not self._http:
-                same = _stamp(self._tried(self._info)) == self._stamp
+                same = state_of(self._tried(self._info)) == self._stamp
             else:
                 end = self._tried(lambda: self._range(max(0, self.size - END_BYTES), self.size))
                 same = self._end in (None, end)
@@ -493,7 +493,8 @@ def _protocols(fs: Any) -> tuple[str, ...]:
     return (protocol,) if isinstance(protocol, str) else tuple(protocol)
 
 
-def _stamp(info: Mapping[str, Any]) -> dict[str, Any]:
+def state_of(info: Mapping[str, Any]) -> dict[str, Any]:
+    """The state of a file by what `info` of its file system says; another file has another one."""
     return {key: info[key] for key in _STAMP if info.get(key) is not None}
 
 

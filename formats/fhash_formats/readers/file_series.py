@@ -326,10 +326,6 @@ class FolderStamp(Stamp):
         return size, digest.digest(), files
 
 
-STATE = ("etag", "e_tag", "lastmodified", "last_modified", "mtime", "created", "version")
-"""Keys of the state beside the size, as fsspec and obstore name what servers and stores say."""
-
-
 @dataclass(frozen=True)
 class UrlStamp(Stamp):
     """State of a file at a URL, as far as its server tells it.
@@ -345,9 +341,10 @@ class UrlStamp(Stamp):
     @classmethod
     def at(cls, url: str, ask: Callable[[], Mapping[str, Any]]) -> Self:
         """The stamp of a file. Raises OSError, or what the library of the store raises."""
-        told = {key.lower(): value for key, value in ask().items()}
-        state = tuple(str(told.get(key)) for key in STATE)
-        return cls(Path(url), int(told.get("size") or 0), state, ask=ask)
+        from fhash_formats.container.remote import state_of
+
+        told = ask()
+        return cls(Path(url), int(told.get("size") or 0), state_of(told), ask=ask)
 
     def again(self) -> Self:
         return self.at(str(self.path), self.ask)
