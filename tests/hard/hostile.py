@@ -128,7 +128,8 @@ def _started(folder: Path) -> subprocess.Popen[str]:
     # A heap of glibc that checks itself: the process ends if it frees an array behind whose end
     # something was written.
     checks = {"LD_PRELOAD": "libc_malloc_debug.so.0", "MALLOC_CHECK_": "3"}
-    environment = {**os.environ, **checks, "OMP_NUM_THREADS": "1"}
+    found = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # what pytest has put there
+    environment = {**os.environ, **checks, **found, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(Path(__file__).with_name("hostile_trial.py")), str(folder)]
     with (folder / "log").open("a") as log:
         return subprocess.Popen(

@@ -1,6 +1,6 @@
 """One hostile file and the commands of `fhash` on it, in a process with bounded memory and time.
 
-    python tests/hard/hostile_trial.py FOLDER
+    PYTHONPATH=tests python tests/hard/hostile_trial.py FOLDER
 
 The script reads numbers of mutations from stdin and answers each with one line of JSON; its files
 lie in FOLDER. With --write NUMBER FILE.fhz it writes the file of a number.
