@@ -6,18 +6,22 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from math import prod
 from threading import Event
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
 from fhash_codec.compact.goal import step_after_gain
-from fhash_codec.compact.head_training import Budget, Pair, Shape, TrainedHead, train_head
+from fhash_codec.compact.head_training import (
+    Budget,
+    Pair,
+    Shape,
+    TrainedHead,
+    foretold_gain,
+    train_head,
+)
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.step import EXACT, octave_gain
 from fhash_codec.compact.tiles import Coding, Outcome
-from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.support.threads import at_most, usable_threads
 from fhash_formats.transform.tile_format import TileSettings
@@ -27,38 +31,15 @@ PERCEPTRON = Shape((12, 8), cross=False)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """A quick training, whose gain tells which heads are worth a full one."""
-
-    shape: Shape
-    budget: Budget
-    factor: float
-    """Gain of the full training of this head as a multiple of the gain of the trial, roughly."""
-    besides: float
-    """Gain in dB of the full training besides that multiple."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Effort:
     """Effort that is spent on the choice of a head."""
 
-    trial: Trial
     candidates: int
     """Number of the first entries of GAIN_BY_WIDTHS that are considered; 0 for no cross."""
     budget: Budget | None
     """Training of a head with a cross; None for none."""
     perceptron: Budget
     """Training of the perceptron, whose updates cost a sixth."""
-    least: float = 0.0
-    """Share of the file that a head must be expected to save."""
-    least_bytes: int = 900
-    """Bytes of tiles below which no head is tried: it takes some hundreds itself."""
-    most_bits: float = math.inf
-    """Bits of a vertex above which no head is tried: none has saved that share there."""
-
-    def tries(self, size: int | float, vertices: int) -> bool:
-        """Whether a head is tried for a series of so many vertices, coded in `size` bytes."""
-        return size >= self.least_bytes and 8 * size <= self.most_bits * vertices
 
     def budget_of(self, shape: Shape) -> Budget:
         """Return the training of a head of a shape."""
@@ -67,36 +48,17 @@ class Effort:
         assert self.budget is not None
         return self.budget
 
-    def expected_gain(self, gain_of_trial: float) -> float:
-        """Return the gain in dB that a full training of the trial head is expected to have."""
-        return self.trial.factor * gain_of_trial + self.trial.besides
-
 
 GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
 """Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
 EFFORTS = {
     5: Effort(
-        trial=Trial(
-            shape=PERCEPTRON,
-            budget=Budget(updates=400, samples=160_000, rate=3e-2),
-            factor=1.2,
-            besides=0.02,
-        ),
         candidates=0,
         budget=None,
         perceptron=Budget(updates=1000, samples=400_000, rate=3e-2),
-        least=0.03,
-        least_bytes=12_000,
-        most_bits=0.75,
     ),
     **{
         effort: Effort(
-            trial=Trial(
-                shape=Shape((8, 8), cross=True),
-                budget=Budget(updates=400, samples=160_000, rate=3e-2),
-                factor=1.2,
-                besides=0.02,
-            ),
             candidates=candidates,
             budget=Budget(updates=updates, samples=400_000),
             perceptron=Budget(updates=2 * updates, samples=800_000),
@@ -111,13 +73,10 @@ EFFORTS = {
 
 At 5 a cross is left out: it gains up to a fifth more, and takes six times as long.
 """
-OF_FEWEST_BYTES: dict[str, Any] = {
-    "least": 0.003,
-    "least_bytes": 900,
-    "most_bits": math.inf,
-    "perceptron": Budget(updates=2000, samples=400_000, rate=3e-2),
-}
-"""Limits of a trial, and the training, where the fewest bytes are wished for at any cost."""
+LEAST_GAIN = 0.1
+"""Gain in dB of least squares below which no head is trained."""
+GAIN_OF_HEAD = 1.6
+"""Gain of a head as a multiple of that of least squares: 1.6 to 1.9 on three series."""
 MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
@@ -132,29 +91,19 @@ WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
 
 
-def effort_of(config: EncodeConfig) -> Effort:
-    """Return the effort that settings ask for, from 5 on."""
-    spent = EFFORTS[config.effort]
-    few = config.access == "small" and spent.least > 0
-    return replace(spent, **OF_FEWEST_BYTES) if few else spent
-
-
-def likely_heads(
-    size: float, gain: float, octave: float, effort: Effort, *, besides: float = 0.0
-) -> list[Shape]:
+def likely_heads(size: float, gain: float, octave: float, effort: Effort) -> list[Shape]:
     """Return the heads that are worth a training; none where none should save anything.
 
     That with a cross and the perceptron are both trained where nothing but a training says which of
     them saves more.
 
     size: bytes of the coded tiles.
-    gain: expected gain in dB of a head of the widths of the trial head.
+    gain: expected gain in dB of a head with a cross of widths (8, 8).
     octave: dB that an octave of bytes buys.
-    besides: bytes of the file without the tiles.
     """
     if not effort.candidates:
         saves = _saved(PERCEPTRON, size, gain, octave)
-        return [PERCEPTRON] if saves > effort.least * (size + besides) else []
+        return [PERCEPTRON] if saves > 0 else []
 
     def saved(widths: tuple[int, int]) -> float:
         return _saved(Shape(widths, cross=True), size, GAIN_BY_WIDTHS[widths] * gain, octave)
@@ -178,8 +127,6 @@ def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
 
 StepSearch = Callable[[TileSettings], tuple[TileSettings, Outcome]]
 """Search for the step that keeps the promise, from that of the settings on."""
-MIN_GAIN = 0.02
-"""Gain in dB of the quick trial on held-out samples below which no head will pay."""
 TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 NEAR_GAIN = 0.2
@@ -218,39 +165,34 @@ def choose_head(
     look: codes the sample once, as that search does.
     """
     sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
-    data_range, spent = task.goal.data_range, effort_of(task.config)
+    data_range, spent = task.goal.data_range, EFFORTS[task.config.effort]
     # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
     aim = None if task.goal.psnr is None else task.goal.psnr + EXACT.aim
-    if not spent.tries(outcome.size, prod(task.blocks.shape)):
-        skip("head", f"tiles of {outcome.size} bytes: heads save little of so few, or of so many")
-        return settings, outcome, []
-    tell = partial(task.parts.report, "training")
 
     def train(shape: Shape, budget: Budget, tell: Callable[[float], None]) -> TrainedHead | None:
         low, high, seed = settings.low, settings.high, task.config.seed
         return train_head(pairs, low, high, shape, budget, seed=seed, progress=tell)
 
-    with stage("head trial", "gain of a quick training, by which heads are chosen"):
+    with stage("head trial", "gain of least squares, by which heads are chosen"):
         pairs = training_pairs(sample, settings, attempt.coding)
-        trial = train(spent.trial.shape, spent.trial.budget, tell)
-    if trial is None or trial.gain_db < MIN_GAIN:
-        skip("head", "its trial gains nothing")
+        foretold = foretold_gain(pairs, settings.low, settings.high, task.config.seed)
+    if foretold < LEAST_GAIN:
+        skip("head", f"least squares gain {foretold:.2f} dB: no head would save enough")
         return settings, outcome, []
+    gain = GAIN_OF_HEAD * foretold
     octave = octave_gain(attempt.tried, data_range)
-    gain = spent.expected_gain(trial.gain_db)
-    shapes = likely_heads(outcome.size, gain, octave, spent, besides=task.goal.overhead)
+    shapes = likely_heads(outcome.size, gain, octave, spent)
     if not shapes:
-        gained = f"its trial gained {trial.gain_db:.2f} dB"
-        skip("head", f"{gained}: no head would save enough")
+        skip("head", f"least squares gain {foretold:.2f} dB: no head would save enough")
         return settings, outcome, []
-    why = f"at effort {task.config.effort}; its trial gained {trial.gain_db:.2f} dB"
+    why = f"at effort {task.config.effort}; least squares gain {foretold:.2f} dB"
     with stage("head", why):
         # A head is trained on what it will meet: coarser data, which it lifts to the promise.
-        coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
+        coarser = replace(settings, step=step_after_gain(settings.step, gain))
         if aim is not None:
             lost = outcome.psnr(data_range) - look(coarser).psnr(data_range)
-            coarser = _coarsened(settings, coarser, lost, trial.gain_db)
-        if trial.gain_db > NEAR_GAIN or not sample.complete:
+            coarser = _coarsened(settings, coarser, lost, gain)
+        if gain > NEAR_GAIN or not sample.complete:
             pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
 
         def train_fully(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:

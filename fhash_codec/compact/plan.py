@@ -23,6 +23,7 @@ from fhash_codec.compact.attempt import (
     parse_tile,
 )
 from fhash_codec.compact.goal import Goal, integer_goal
+from fhash_codec.compact.planner import is_priced, plan_by_prices
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import (
     choose_predicted,
@@ -384,13 +385,17 @@ def _by_trial(
     task: PlanTask, tiled: Blocks, settings: TileSettings, trial: LabelTrial | None
 ) -> CodingPlan:
     """Return the plan after trials of all choices, or of labels where these need fewer bytes."""
-    with stage("first guess", "approximate bytes, by which tiles are chosen"):
-        attempt = first_guess(task, tiled, settings)
+    if by_prices := is_priced(task, tiled, settings):
+        attempt = plan_by_prices(task, settings)
+    else:
+        with stage("first guess", "approximate bytes, by which tiles are chosen"):
+            attempt = first_guess(task, tiled, settings)
     if trial is not None and not task.goal.lossless:
         trial = with_step_of(trial, attempt)
-    if trial is not None and ends_trials(trial, attempt.outcome.size):
-        return _label_plan(task, tiled_labels(task, trial))
-    attempt = _improved(task, attempt)
+    if not by_prices:
+        if trial is not None and ends_trials(trial, attempt.outcome.size):
+            return _label_plan(task, tiled_labels(task, trial))
+        attempt = _improved(task, attempt)
     settings = attempt.settings
     if trial is not None and trial.attempt.outcome.size <= LIKELY * attempt.outcome.size:
         labelled = tiled_labels(task, trial)
@@ -398,16 +403,21 @@ def _by_trial(
             return _label_plan(task, labelled)
     if trial is not None and task.goal.lossless:
         settings = replace(settings, labels=True)
+    blocks = attempt.sample.blocks
+    # The tiles are kept as they decode, unless they are coded already, for a head.
+    coded = attempt.sample.complete and bool(attempt.tried)
+    small = prod(blocks.shape) * blocks.dtype.itemsize <= MAX_BYTES_KEPT
     return CodingPlan(
-        blocks=attempt.sample.blocks,
-        sample=attempt.sample,
+        blocks=blocks,
+        sample=attempt.sample if coded or not by_prices else None,
         settings=settings,
-        coding=task.goal.bounded(_final_coding(task, attempt)),
+        coding=task.goal.bounded(attempt.coding if by_prices else _final_coding(task, attempt)),
         goal=task.goal,
         gains=task.gains.entries,
         history=attempt.history,
         tiling=attempt.tiling,
         size=attempt.outcome.size if _keeps_promise(task, attempt.outcome) else math.inf,
+        keeps_decoded=by_prices and not coded and small,
     )
 
 

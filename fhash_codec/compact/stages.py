@@ -264,7 +264,7 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     coding = Coding(
         filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick, rough=quick
     )
-    settings = _with_mask(task, sample, settings, task.goal.expected_error)
+    settings = with_mask(task, sample, settings, task.goal.expected_error)
     looked = sample
     if quick and task.goal.psnr is not None:
         looked = priced(sample, settings, task.config.effort)
@@ -506,7 +506,7 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     tries = 3 if task.config.effort == 1 or attempt.quick else 5
     tried: list[Outcome] = []
     precision = _precision(task, attempt)
-    if not attempt.quick and not _without_head(task, attempt):
+    if not attempt.quick and not without_head(task, attempt):
         precision = NEAR
     settings, fitted = attempt.settings, None
     if attempt.quick:
@@ -538,7 +538,7 @@ def _with_new_mask(
     """Return settings with scores of a mask for the error that a bound or a size leaves."""
     if task.goal.psnr is not None or not outcome.count:
         return settings
-    return _with_mask(task, sample, settings, math.sqrt(outcome.squares / outcome.count))
+    return with_mask(task, sample, settings, math.sqrt(outcome.squares / outcome.count))
 
 
 def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -550,7 +550,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
     if attempt.quick and predicted < WITH_HEAD * attempt.outcome.size:
         skip("head", "predicted values take fewer bytes than it would leave")
         return attempt
-    if reason := _without_head(task, attempt):
+    if reason := without_head(task, attempt):
         skip("head", reason)
         return attempt
 
@@ -606,7 +606,7 @@ def _precision(task: PlanTask, attempt: Attempt) -> Precision:
     return replace(QUICK, slope=task.slope) if attempt.quick else EXACT
 
 
-def _without_head(task: PlanTask, attempt: Attempt) -> str:
+def without_head(task: PlanTask, attempt: Attempt) -> str:
     """Return why no head is to be trained; "" where one is."""
     goal, effort = task.goal, task.config.effort
     if effort < MIN_HEAD_EFFORT:
@@ -702,9 +702,7 @@ def _sample(task: PlanTask, tiled: Blocks, settings: TileSettings, max_vertices:
     return Sample(tiled, max_vertices, task.workers, costs, task.parts.tick).filled(usual, 1)
 
 
-def _with_mask(
-    task: PlanTask, sample: Sample, settings: TileSettings, error: float
-) -> TileSettings:
+def with_mask(task: PlanTask, sample: Sample, settings: TileSettings, error: float) -> TileSettings:
     """Return settings with scores for the mask of the vertices that count, if there is one.
 
     error: root of the mean squared error of the decoded values, in data units.

@@ -235,6 +235,16 @@ class Blocks:
             frames, mask = self._steps(steps)
             yield frames if mask is None else frames[mask]
 
+    @property
+    def counted_vertices(self) -> int:
+        """Number of vertices of the box over all steps that are in the coreset."""
+        return self._extent.samples
+
+    @property
+    def values_in_memory(self) -> Values:
+        """Values (t, z, y, x) of the box over all steps, less the origin, which stay in memory."""
+        return self._whole().values
+
     def _whole(self) -> Tile:
         """Return the box over all steps, which is read at the first call."""
         with self._box.lock:

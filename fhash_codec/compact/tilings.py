@@ -277,7 +277,7 @@ def choose_tiling(
     """
     shape = task.blocks.shape
     if prod(shape) > MAX_WHOLE_VERTICES:
-        candidates = _tiles_of_large(task.blocks)
+        candidates = tiles_of_large(task.blocks)
     else:
         candidates = tiles_to_try(shape, MAX_WHOLE_VERTICES, slabs=True)
     if candidates == [shape]:
@@ -550,7 +550,7 @@ def largest_tile(shape: Shape) -> Shape:
     return max(some or tiles, key=lambda tile: (prod(tile[1:]), tile[0]))
 
 
-def _tiles_of_large(blocks: Blocks) -> list[Shape]:
+def tiles_of_large(blocks: Blocks) -> list[Shape]:
     """Return the tiles that may be tried for a series that is too large for a single one.
 
     A reader that goes from step to step keeps the tiles of a layer as far as its cache reaches; of

@@ -29,6 +29,7 @@ from fhash_formats.transform.spec import (
 )
 from fhash_formats.transform.tile import forward, plain_step
 from fhash_formats.transform.tile_format import Shape, TileSettings
+from fhash_formats.transform.values import all_finite
 
 Gram = npt.NDArray[np.float64]
 """Products of lines (length, length)."""
@@ -643,7 +644,7 @@ def estimated_size(
     some = [indices[number] for number in sorted(spread_order(len(indices))[:count])]
     share = count / len(indices)
     series = _sum(_tile_magnitudes(blocks, settings, workers, some))
-    error = _squared_error(blocks, psnr, data_range) * share
+    error = squared_error(math.prod(blocks.shape), psnr, data_range) * share
     return series.size(series.step(error, data_range * MIN_STEP_SHARE)) / share
 
 
@@ -665,10 +666,12 @@ def estimated_step(
     The series must be in memory, all of its vertices in the coreset, and coded in float32.
     """
     min_step = data_range * MIN_STEP_SHARE
-    error = _squared_error(blocks, psnr, data_range)
+    error = squared_error(math.prod(blocks.shape), psnr, data_range)
     tiles = _tile_magnitudes(blocks, settings, workers)
     series = _sum(tiles)
-    step = series.step(_squared_error(blocks, even_psnr or psnr, data_range), min_step)
+    step = series.step(
+        squared_error(math.prod(blocks.shape), even_psnr or psnr, data_range), min_step
+    )
     if math.prod(blocks.tile) > TRIAL_VERTICES:
         # Large tiles take long to code, and smaller ones tell as much.
         parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1
@@ -699,9 +702,9 @@ def estimated_step(
     return min(step, series.step(error * len(ratios) / bulk, min_step))
 
 
-def _squared_error(blocks: Blocks, psnr: float, data_range: float) -> float:
-    """Return the sum of the squared errors over a series at a PSNR (dB)."""
-    return math.prod(blocks.shape) * data_range**2 * 10 ** (-psnr / 10)
+def squared_error(vertices: int, psnr: float, data_range: float) -> float:
+    """Return the sum of the squared errors over so many vertices at a PSNR (dB)."""
+    return vertices * data_range**2 * 10 ** (-psnr / 10)
 
 
 def _tile_magnitudes(
@@ -711,17 +714,32 @@ def _tile_magnitudes(
     indices: Sequence[Index] | None = None,
 ) -> list[Magnitudes]:
     """Return the magnitudes of the coefficients of some tiles; of all, in C order, if None."""
-    # Only the kinds of the transform matter; float32 is precise enough.
+
+    def of_tile(index: Index) -> Magnitudes:
+        return magnitudes_of(blocks.read(index).values, settings)
+
+    return list(workers.map(of_tile, blocks.indices() if indices is None else indices))
+
+
+def magnitudes_of(values: npt.NDArray[Any], settings: TileSettings) -> Magnitudes:
+    """Return the magnitudes of the coefficients of a tile (t, z, y, x).
+
+    Only the kinds of the transform matter; float32 is precise enough.
+    """
     kinds = replace(settings, double=False, step=1.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = values.astype(np.float32)
+        single -= np.float32(settings.center)
+    if not all_finite(single):
+        single[~np.isfinite(single)] = 0
+    return magnitudes(forward(single, kinds))
 
-    def tile_magnitudes(index: Index) -> Magnitudes:
-        with np.errstate(over="ignore", invalid="ignore"):
-            values = blocks.read(index).values.astype(np.float32)
-            values -= np.float32(settings.center)
-            values[~np.isfinite(values)] = 0
-            return magnitudes(forward(values, kinds))
 
-    return list(workers.map(tile_magnitudes, blocks.indices() if indices is None else indices))
+def magnitudes_of_all(
+    blocks: Blocks, settings: TileSettings, workers: ThreadPoolExecutor
+) -> Magnitudes:
+    """Return the magnitudes of the coefficients of all tiles together."""
+    return _sum(_tile_magnitudes(blocks, settings, workers))
 
 
 def _sum(tiles: Sequence[Magnitudes]) -> Magnitudes:

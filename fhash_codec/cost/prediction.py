@@ -17,14 +17,17 @@ import numpy as np
 from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
 from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.head import (
-    MIN_GAIN,
+    EFFORTS,
+    GAIN_OF_HEAD,
+    LEAST_GAIN,
     NEAR_GAIN,
+    PERCEPTRON,
     TRAINING_VERTICES,
-    effort_of,
     likely_heads,
 )
 from fhash_codec.compact.head_training import Budget
 from fhash_codec.compact.plan import ends_trials
+from fhash_codec.compact.planner import CODED_VERTICES, PRICED_VERTICES, is_priced
 from fhash_codec.compact.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.stages import (
     LEAST,
@@ -97,8 +100,8 @@ SAMPLED_PASSES = 2.0
 """Times that all tiles are coded for a PSNR, where the step was searched on a sample."""
 SIZE_PASSES = 2.0
 """Times that all tiles are coded for a promised ratio."""
-GAIN_AFTER = 1.6
-"""Gain of the trial head as a multiple of that after the few updates of a probe."""
+PRICES_OF_PARTS = 20
+"""Times that the parts of a series are priced."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,8 +172,11 @@ def stage_seconds(
             "estimate": 2 * look.costing + trials,
             "coding": _all_tiles(work, rates.trial),
         }
-    seconds["first guess"] = look.guessing
-    seconds |= _choices(work)
+    if by_prices := is_priced(look.task, look.task.blocks, look.attempt.settings):
+        seconds |= _prices(work)
+    else:
+        seconds["first guess"] = look.guessing
+        seconds |= _choices(work)
     final = rates.final
     if head is not None:
         told = _head(work, head)
@@ -180,7 +186,9 @@ def stage_seconds(
         seconds["predictor"] = _predictor(work)
     goal = look.task.goal
     passes = PASSES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLED_PASSES
-    if goal.psnr is None:
+    if by_prices:
+        passes = 1.0 + PASSES
+    elif goal.psnr is None:
         passes = float(work.coded_anew) if goal.error is not None else SIZE_PASSES
     return seconds | {"coding": passes * _all_tiles(work, final)}
 
@@ -195,6 +203,19 @@ def _estimated(look: Look, config: EncodeConfig) -> bool:
         and look.task.blocks.complete
         and not look.attempt.settings.double
     )
+
+
+def _prices(work: _Work) -> dict[str, float]:
+    """Seconds of a plan by prices, see fhash_codec/compact/planner.py."""
+    look, rates = work.look, work.rates
+    priced = min(2 * PRICED_VERTICES, work.vertices)
+    price = rates.trial if rates.price is None else rates.price
+    coded = min(2 * CODED_VERTICES, 2 * work.vertices) / usable_threads()
+    return {
+        "plan": 2 * look.costing + PRICES_OF_PARTS * priced * price / usable_threads(),
+        "bases": (rates.basis if rates.has_bases else 0.0) * work.vertices,
+        "step": look.costing + coded * rates.search,
+    }
 
 
 def _choices(work: _Work) -> dict[str, float]:
@@ -273,23 +294,19 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     limit = MAX_SEARCHED_VERTICES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
     searched = work.tiles(tile, limit)
     size = work.bytes_of_tiles
-    spent = effort_of(config)
-    if not spent.tries(size, work.vertices):
-        return {}
+    spent = EFFORTS[config.effort]
     strict = bool(look.task.goal.error)
     # Without a bound the tiles are coded already, and are only decoded.
     known = rates.search if strict else rates.decode
     pairs = work.wall(known, tile, searched)
-    seconds = {"head trial": pairs + _training(head, spent.trial.budget, 1.0, 1.0)}
-    gain = GAIN_AFTER * head.gain_db
-    if gain < MIN_GAIN:
+    seconds = {"head trial": head.looking}
+    if head.gain_db < LEAST_GAIN:
         return seconds
-    shapes = likely_heads(
-        size, spent.expected_gain(gain), EXCHANGE, spent, besides=look.task.goal.overhead
-    )
+    seconds["head trial"] += pairs
+    shapes = likely_heads(size, GAIN_OF_HEAD * head.gain_db, EXCHANGE, spent)
     if not shapes:
         return seconds
-    trial = spent.trial.shape
+    trial = PERCEPTRON
     parts = [
         _training(
             head,
@@ -301,7 +318,7 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     ]
     # Each training takes one thread.
     alone = max(max(parts), sum(parts) / threads)
-    again = gain > NEAR_GAIN or searched < work.tiles(tile)
+    again = GAIN_OF_HEAD * head.gain_db > NEAR_GAIN or searched < work.tiles(tile)
     wider = work.wall(rates.search, tile, work.tiles(tile, TRAINING_VERTICES)) if again else 0.0
     looks = 0 if strict and len(shapes) == 1 else len(shapes)
     search = work.tries(HEAD_TRIES) * work.wall(rates.search + head.final, tile, searched)

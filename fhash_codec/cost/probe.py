@@ -23,13 +23,14 @@ from fhash_codec.compact.attempt import (
     parse_tile,
 )
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.head import EFFORTS, training_pairs
+from fhash_codec.compact.head import PERCEPTRON, training_pairs
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     CHOSEN_AT,
     MEASUREMENTS,
     STARTS,
     Budget,
+    foretold_gain,
     train_head,
 )
 from fhash_codec.compact.plan import LabelTrial, has_labels, look_at_labels
@@ -382,16 +383,18 @@ FORWARD = 1 / 3
 
 @dataclass(frozen=True, kw_only=True)
 class HeadProbe:
-    """A short training of the trial head, and the rates that follow from it.
+    """What least squares foretell of heads, a short training of one, and rates that follow from it.
 
     Attributes:
-        gain_db: gain in dB on held-out voxels, after HEAD_UPDATES updates.
-        update: seconds of an update of the trial head.
+        gain_db: gain in dB of least squares.
+        looking: seconds of these.
+        update: seconds of an update of the head.
         sampling: seconds for each voxel that is drawn.
         final: rate of coding with the head, beyond that without.
     """
 
     gain_db: float
+    looking: float
     update: float
     sampling: float
     final: float
@@ -401,11 +404,12 @@ def probe_head(look: Look, rates: Rates, config: EncodeConfig) -> HeadProbe | No
     """Train a head for a moment; None where there is nothing to learn."""
     coding = replace(search_coding(look, config.effort), error=None)
     pairs = training_pairs(rates.sample, rates.settings, coding)
-    begun = now()
     low, high = rates.settings.low, rates.settings.high
+    begun = now()
+    gain = foretold_gain(pairs, low, high, config.seed)
+    looking, begun = now() - begun, now()
     budget = Budget(updates=HEAD_UPDATES, samples=HEAD_SAMPLES)
-    shape = EFFORTS[config.effort].trial.shape
-    trained = train_head(pairs, low, high, shape, budget, seed=config.seed)
+    trained = train_head(pairs, low, high, PERCEPTRON, budget, seed=config.seed)
     if trained is None:
         return None
     seconds = now() - begun
@@ -413,7 +417,8 @@ def probe_head(look: Look, rates: Rates, config: EncodeConfig) -> HeadProbe | No
     with_head = replace(rates.settings, head=trained.head)
     final = coded_tiles(rates.sample, with_head, search_coding(look, config.effort))[0]
     return HeadProbe(
-        gain_db=trained.gain_db,
+        gain_db=gain,
+        looking=looking,
         update=training / updates_of(HEAD_UPDATES, HEAD_SAMPLES),
         sampling=(seconds - training) / (HEAD_SAMPLES * (1 + TESTED)),
         final=max(final - rates.search, 0.0),

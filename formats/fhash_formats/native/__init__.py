@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 18
+ABI_VERSION = 19
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -63,6 +63,7 @@ _TILES: Prototypes = {
     "fhash_tile_foretell": (*_TILE, ARRAY, REAL, REAL, ARRAY, ARRAY),
     "fhash_tile_foretold": (*_TILE, *(ARRAY,) * 4),
     "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
+    "fhash_plan": (*(ARRAY,) * 4,),
     "fhash_tile_free": (ARRAY,),
     "fhash_tile_bound": (ARRAY,),
     "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),

@@ -10,7 +10,7 @@
     FIND(decode_labels) FIND(decode_mask) FIND(decode_predicted) FIND(dequantise_f32) \
     FIND(dequantise_f64) FIND(encode) FIND(encode_block) FIND(encode_labels) FIND(encode_mask) \
     FIND(encode_predicted) FIND(fast_decode) FIND(fast_encode) FIND(free_f32) FIND(free_f64) \
-    FIND(head_apply) FIND(mask_levels_f32) FIND(mask_levels_f64) FIND(quantise_f32) \
+    FIND(head_apply) FIND(mask_levels_f32) FIND(mask_levels_f64) FIND(plan) FIND(quantise_f32) \
     FIND(quantise_f64) FIND(reconstruct_f32) FIND(reconstruct_f64) FIND(residual_f32_f32) \
     FIND(residual_f32_f64) FIND(residual_f64_f32) FIND(residual_f64_f64) FIND(tile_fill) \
     FIND(tile_foretell) FIND(tile_foretold) FIND(tile_forward) FIND(tile_part) FIND(tile_table) \

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "basis.hpp"
 #include "bytes.hpp"
 #include "coding.hpp"
 
@@ -34,7 +35,7 @@ namespace {
 constexpr int DOUBLE = 1, CLIP = 2, LABELS = 4, TRELLIS = 8;
 constexpr int WHOLE = 16, HEAD = 32, MASK = 64, PREDICTOR = 128;
 constexpr int64_t MAX_LENGTH = 512;  // longest axis that may have a basis of its own
-constexpr int MAX_EXPONENT = 24, MAX_DEPTH = 10;
+constexpr int MAX_DEPTH = 10;
 constexpr int MAX_WEIGHT = 31;       // of a head
 constexpr size_t REMEMBERED = 64;    // settings that a context keeps
 
@@ -68,27 +69,37 @@ double cosine(int64_t m, int64_t n) {
     return sine ? angle * total : total;
 }
 
-// 2^(-exponent / 2), by exact powers of two and one constant.
+}  // namespace
+
 double shrink(int exponent) {
     return std::ldexp(exponent % 2 ? 0.7071067811865476 : 1.0, -(exponent / 2));
 }
+
+std::vector<double> dct_rows(int64_t n) {
+    std::vector<double> cosines((size_t)(4 * n)), rows((size_t)(n * n));
+    for (int64_t m = 0; m < 4 * n; m++) cosines[(size_t)m] = cosine(m, n);
+    for (int64_t k = 0; k < n; k++) {
+        const double unit = std::sqrt((k ? 2.0 : 1.0) / (double)n);
+        for (int64_t i = 0; i < n; i++)
+            rows[(size_t)(k * n + i)] = cosines[(size_t)((2 * i + 1) * k % (4 * n))] * unit;
+    }
+    return rows;
+}
+
+namespace {
 
 // The vectors of a basis from their coefficients of the DCT, (rank, n).
 std::vector<float> synthesis_of(const std::vector<int32_t>& integers,
                                 const std::vector<int>& exponents, int64_t n) {
     const int64_t rank = (int64_t)exponents.size();
-    std::vector<double> cosines((size_t)(4 * n)), vectors((size_t)(rank * n), 0.0), row((size_t)n);
-    for (int64_t m = 0; m < 4 * n; m++) cosines[(size_t)m] = cosine(m, n);
-    for (int64_t k = 0; k < n; k++) {
-        const double unit = std::sqrt((k ? 2.0 : 1.0) / (double)n);
-        for (int64_t i = 0; i < n; i++)
-            row[(size_t)i] = cosines[(size_t)((2 * i + 1) * k % (4 * n))] * unit;
+    const std::vector<double> rows = dct_rows(n);
+    std::vector<double> vectors((size_t)(rank * n), 0.0);
+    for (int64_t k = 0; k < n; k++)
         for (int64_t r = 0; r < rank; r++) {
             const double factor = (double)integers[(size_t)(r * n + k)];
             double* const out = vectors.data() + r * n;
-            for (int64_t i = 0; i < n; i++) out[i] += factor * row[(size_t)i];
+            for (int64_t i = 0; i < n; i++) out[i] += factor * rows[(size_t)(k * n + i)];
         }
-    }
     std::vector<float> result((size_t)(n * rank));
     for (int64_t r = 0; r < rank; r++) {
         const double scale = shrink(exponents[(size_t)r]);
@@ -116,6 +127,8 @@ bool read_exponents(Bytes& data, int64_t rank, std::vector<int>& exponents) {
     data.at += (position + 7) / 8;
     return true;
 }
+
+}  // namespace
 
 std::shared_ptr<const Basis> read_basis(Bytes data, fhash_error& error) {
     uint16_t n, rank;
@@ -151,6 +164,8 @@ std::shared_ptr<const Basis> read_basis(Bytes data, fhash_error& error) {
     basis->synthesis = synthesis_of(integers, exponents, n);
     return basis;
 }
+
+namespace {
 
 bool read_axes(Bytes& data, const uint8_t* packed, Settings& settings, fhash_error& error) {
     for (int a = 0; a < 4; a++) {

@@ -120,10 +120,18 @@ def _tile_of(values: Values, settings: TileSettings) -> _Tile:
 
 def _call(name: str, tile: _Tile, *arguments: Any) -> None:
     """Call a function on a tile. Raises DamagedFileError, InputError or MemoryError."""
+    call_with_context(name, ctypes.byref(tile), *arguments)
+
+
+def call_with_context(name: str, *arguments: Any) -> None:
+    """Call a function between a context and room for an error.
+
+    Raises DamagedFileError, InputError or MemoryError.
+    """
     error = _Error()
     context = _context(usable_threads())
     function = getattr(native.library(), name)
-    status = function(context, ctypes.byref(tile), *arguments, ctypes.byref(error))
+    status = function(context, *arguments, ctypes.byref(error))
     if not status:
         return
     text = error.text.decode("utf-8", "replace")

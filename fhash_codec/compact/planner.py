@@ -1,0 +1,588 @@
+"""Plan by prices: fhash_plan of libfhash (native/planner.cpp), and what its plan is checked by.
+
+The planner sees some parts of a series and codes nothing. What prices do not know is measured on a
+few coded parts: which coder takes how many bytes, and the error that a trellis and a bulk leave.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.compact.attempt import (
+    DECODING_NS,
+    FAST_BYTES,
+    MARGIN,
+    MAX_WHOLE_VERTICES,
+    PRICES,
+    REGION_MS,
+    TRANSFORM_NS,
+    WORTH,
+    Attempt,
+    PlanTask,
+    Tiling,
+    decoding_ns,
+    is_small,
+    region_vertices,
+    sub_tile,
+    tiles_to_try,
+)
+from fhash_codec.compact.goal import EXCHANGE, SLOPE, Goal
+from fhash_codec.compact.head import LEAST_GAIN, training_pairs
+from fhash_codec.compact.head_training import foretold_gain
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample
+from fhash_codec.compact.stages import (
+    MAX_SEARCHED_VERTICES,
+    SAMPLE_VERTICES,
+    choose_predicted,
+    mean_center,
+    plateau_center,
+    try_head,
+    try_predictor,
+    with_mask,
+    without_head,
+)
+from fhash_codec.compact.step import allows_trellis, on_trellis, with_step
+from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome
+from fhash_codec.compact.tilings import tiles_of_large
+from fhash_codec.compact.transform import (
+    Bases,
+    magnitudes_of,
+    magnitudes_of_all,
+    moved_transform,
+    refit,
+    squared_error,
+    usual_transform,
+)
+from fhash_codec.progress import skip, stage, tell
+from fhash_formats.support.values import Single
+from fhash_formats.transform.spec import KINDS, AxisTransform, TransformSpec
+from fhash_formats.transform.tile import call_with_context
+from fhash_formats.transform.tile_format import Shape, TileSettings
+from fhash_formats.transform.values import all_finite
+
+PART_VERTICES = 1 << 16
+"""Vertices of a part that is priced: smaller ones take longer for each vertex."""
+PRICED_VERTICES = 1 << 18
+"""Vertices of all parts of one kind: prices of twice as many chose the same within 0.5 %."""
+OF_PLATEAU = 4
+"""Vertices of parts beside a plateau, where they cost little, as a multiple of the usual ones.
+
+Thin shells take all of the bytes, and small parts hold little of them (a shock took 1.3 times the
+bytes).
+"""
+CODED_PART = 1 << 18
+"""Vertices of a part that is coded."""
+CODED_VERTICES = 1 << 19
+"""Vertices of all parts that are coded: a single one foretold a wrong coder."""
+FILLING = 2
+"""Thoroughness (density) of the filling that competes with the present values of a feature."""
+LINES = 2048
+"""Lines along an axis that its own basis is foretold by, some for each of its vertices."""
+
+
+def sheet_of(shape: Shape, vertices: int) -> Shape:
+    """Return a part of a box with all of y and x where they can be: t and z are shortened first."""
+    t, z, y, x = shape
+    while t * z * y * x > vertices and max(t, z) > 2:
+        t, z = (max(2, t // 2), z) if t >= z else (t, max(2, z // 2))
+    while t * z * y * x > vertices and max(y, x) > 8:
+        y, x = (y // 2, x) if y >= x else (y, x // 2)
+    return t, z, y, x
+
+
+COLUMNS = ((8, 64), (8, 32), (4, 32), (4, 16), (2, 16))
+"""Vertices along y and x to which columns are shortened, one after the other.
+
+A coder takes up to three times as long for each value of shorter rows.
+"""
+
+
+def column_of(shape: Shape, vertices: int) -> Shape:
+    """Return a part of a box with all of t and z where they can be: y and x are shortened first."""
+    t, z, y, x = shape
+    for least_y, least_x in COLUMNS:
+        while t * z * y * x > vertices and (y > least_y or x > least_x):
+            if y > least_y and (y >= x or x <= least_x):
+                y = max(least_y, (y + 1) // 2)
+            else:
+                x = max(least_x, (x + 1) // 2)
+    while t * z * y * x > 2 * vertices and max(t, z) > 8:
+        t, z = ((t + 1) // 2, z) if t >= z else (t, (z + 1) // 2)
+    return t, z, y, x
+
+
+def is_priced(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool:
+    """Whether a series is planned by prices: those know no size yet."""
+    goal = task.goal
+    return (
+        task.config.effort > 1
+        and (goal.psnr is not None or (goal.error is not None and not goal.lossless))
+        and goal.data_range > 0
+        and tiled.in_memory
+        and not settings.double
+        and not task.config.without
+    )
+
+
+class _Parts(ctypes.Structure):
+    """fhash_plan_parts (native/planner.hpp)."""
+
+    _fields_ = (
+        ("shape", ctypes.c_int64 * 4),
+        ("count", ctypes.c_int64),
+        ("values", ctypes.c_void_p),
+        ("counted", ctypes.c_void_p),
+        ("weights", ctypes.c_void_p),
+    )
+
+
+class _Task(ctypes.Structure):
+    """fhash_plan_task (native/planner.hpp)."""
+
+    _fields_ = (
+        ("shape", ctypes.c_int64 * 4),
+        ("columns", _Parts),
+        ("sheets", _Parts),
+        ("lines", ctypes.c_void_p * 4),
+        ("line_counts", ctypes.c_int64 * 4),
+        ("tiles", ctypes.c_void_p),
+        ("works", ctypes.c_void_p),
+        ("tile_count", ctypes.c_int64),
+        ("worth", ctypes.c_double),
+        ("region_ns", ctypes.c_double),
+        ("vertex_ns", ctypes.c_double),
+        ("bit_ns", ctypes.c_double),
+        ("most", ctypes.c_double),
+        ("step", ctypes.c_double),
+        ("mean_square", ctypes.c_double),
+        ("error", ctypes.c_double),
+        ("bytes", ctypes.c_double),
+        ("halves", ctypes.c_int32),
+        ("reserved", ctypes.c_int32),
+    )
+
+
+class _Result(ctypes.Structure):
+    """fhash_plan_result (native/planner.hpp)."""
+
+    _fields_ = (
+        ("tile", ctypes.c_int64 * 4),
+        ("kinds", ctypes.c_int32 * 4),
+        ("depths", ctypes.c_int32 * 4),
+        ("step", ctypes.c_double),
+        ("bytes", ctypes.c_double),
+        ("price", ctypes.c_double),
+        ("priced", ctypes.c_int64),
+        ("tried", ctypes.c_int64),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Priced:
+    """What the planner has found.
+
+    Attributes:
+        tile: shape of the tiles.
+        axes: kind and levels of the transform along each axis; a basis is not fitted yet.
+        step: of the plain quantiser, in data units.
+        size: bytes of all tiles, by price.
+        price: bytes of the tiling, as a multiple of the fewest.
+    """
+
+    tile: Shape
+    axes: tuple[tuple[str, int], ...]
+    step: float
+    size: float
+    price: float
+
+    def transform(self, bases: Bases) -> TransformSpec:
+        """Return the transform, with bases of the data's own where it has some."""
+        t, z, y, x = (
+            bases.along(axis) if kind == "klt" else AxisTransform(kind=kind, depth=depth)
+            for axis, (kind, depth) in enumerate(self.axes)
+        )
+        return TransformSpec(axes=(t, z, y, x))
+
+
+def _float32(values: npt.NDArray[Any], center: float) -> Single:
+    """Return finite values about a centre."""
+    about = np.ascontiguousarray(values, np.float32) - np.float32(center)
+    if not all_finite(about):
+        np.nan_to_num(about, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    return about
+
+
+def lines_along(values: npt.NDArray[Any], axis: int, center: float) -> Single:
+    """Return lines along an axis of an array (t, z, y, x), spread evenly: (count, length)."""
+    others = [length for number, length in enumerate(values.shape) if number != axis]
+    count = prod(others)
+    numbers = np.unique(np.linspace(0, count - 1, min(LINES, count)).astype(np.int64))
+    places = np.unravel_index(numbers, others)
+    return np.ascontiguousarray(_float32(np.moveaxis(values, axis, -1)[places], center))
+
+
+def priced_plan(
+    task: PlanTask,
+    settings: TileSettings,
+    columns: Sample,
+    sheets: Sample | None,
+    tiles: Sequence[Shape],
+) -> Priced:
+    """Return what the planner finds.
+
+    settings: centre, and the step to begin with.
+    columns, sheets: parts, see `column_of` and `sheet_of`; None where columns are sheets, too.
+    tiles: candidates.
+    """
+    config, goal, blocks = task.config, task.goal, task.blocks
+    held: list[npt.NDArray[Any]] = []
+
+    def address(array: npt.NDArray[Any]) -> int:
+        held.append(array)
+        return array.ctypes.data
+
+    def parts(sample: Sample) -> _Parts:
+        values = np.stack([_float32(tile.values, settings.center) for tile in sample.tiles])
+        counted = None
+        if any(tile.counted is not None for tile in sample.tiles):
+            masks = (
+                np.ones(tile.values.shape, bool) if tile.counted is None else tile.counted
+                for tile in sample.tiles
+            )
+            counted = address(np.stack(list(masks)).astype(np.uint8))
+        weights = np.array(sample.weights, np.float64)
+        weights *= prod(blocks.shape) / (weights.sum() * prod(values.shape[1:]))
+        shape = (ctypes.c_int64 * 4)(*values.shape[1:])
+        return _Parts(shape, len(values), address(values), counted, address(weights))
+
+    first, more = DECODING_NS["fast"]
+    given = _Task(
+        shape=(ctypes.c_int64 * 4)(*blocks.shape),
+        columns=parts(columns),
+        tiles=address(np.array(tiles, np.int64)),
+        works=address(np.array([region_vertices(blocks.shape, tile) for tile in tiles])),
+        tile_count=len(tiles),
+        worth=WORTH[config.access],
+        region_ns=1e6 * REGION_MS[config.access],
+        vertex_ns=TRANSFORM_NS + first,
+        bit_ns=more,
+        most=max(PRICES[config.access] - MARGIN, 1.0),
+        step=settings.step,
+        mean_square=0.0 if goal.psnr is None else goal.expected_error**2,
+        error=goal.error or 0.0,
+        halves=config.effort <= MAX_PRICED_EFFORT,
+    )
+    if sheets is not None:
+        given.sheets = parts(sheets)
+    whole = blocks.values_in_memory
+    for axis, length in enumerate(blocks.shape):
+        if length > 1:
+            lines = lines_along(whole, axis, settings.center)
+            given.lines[axis], given.line_counts[axis] = address(lines), len(lines)
+    found = _Result()
+    call_with_context("fhash_plan", ctypes.byref(given), ctypes.byref(found))
+    t, z, y, x = found.tile
+    return Priced(
+        tile=(t, z, y, x),
+        axes=tuple(
+            (KINDS[kind], depth) for kind, depth in zip(found.kinds, found.depths, strict=True)
+        ),
+        step=found.step,
+        size=found.bytes,
+        price=found.price,
+    )
+
+
+def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
+    """Return the plan of a series that `is_priced`, with the step that should keep the promise.
+
+    Where some vertices do not count, it is made once for the values that they have, and once for
+    fill values; the plan of the fewest bytes is taken.
+
+    settings: with a first guess of the step.
+    """
+    task.parts.begin("tiles and transform")
+    fillings = (False,) if task.blocks.complete else (False, True)
+    plans = [_plan(task, settings, filled=filled) for filled in fillings]
+    attempt, parts, moved = min(plans, key=lambda plan: plan[0].outcome.size)
+    task.gains.note("transform by trial", attempt.outcome)
+    if task.goal.psnr is not None:
+        return with_head(task, attempt, parts, moved)
+    # What a predictor competes with is no estimate.
+    attempt = try_predictor(task, _on_all_tiles(task, attempt))
+    attempt = with_head(task, attempt, parts, moved)
+    return choose_predicted(task, attempt)
+
+
+def _plan(
+    task: PlanTask, settings: TileSettings, *, filled: bool
+) -> tuple[Attempt, Sample, TileSettings]:
+    """Return a plan, coded parts of its tiles, and their settings."""
+    blocks, goal, config = task.blocks, task.goal, task.config
+    with stage("plan", "tiles, transform and step, by prices of some parts"):
+        columns, larger = _parts(task, settings, column_of, 1), 1
+        center = plateau_center(columns, task.value_range)
+        if center is None:
+            center = mean_center(columns, task.value_range)
+        else:
+            larger = OF_PLATEAU
+            columns = _parts(task, settings, column_of, larger)
+        sheets = None
+        if columns.blocks.tile[2:] != blocks.shape[2:]:
+            sheets = _parts(task, settings, sheet_of, larger)
+        settings = replace(settings, center=center)
+        if filled:
+            columns, sheets = _filled(columns, settings), sheets and _filled(sheets, settings)
+        found = priced_plan(task, settings, columns, sheets, _candidates(task))
+    tiling = None
+    if task.fixed_tile is None:
+        tiling = Tiling(tile=found.tile, price=found.price)
+        tell("plan", f"--access {config.access}: {tiling.describe()}")
+    import os
+
+    if os.environ.get("V"):
+        print(
+            "   ",
+            found,
+            columns.blocks.tile,
+            len(columns.tiles),
+            sheets and (sheets.blocks.tile, len(sheets.tiles)),
+        )
+    tiled = blocks.retile(found.tile)
+    sample = Sample(tiled, 1, task.workers)
+    rounding = float(np.finfo(blocks.dtype).eps) / 2 if blocks.dtype.kind == "f" else 0.0
+    settings = with_step(settings, found.step, goal, rounding)
+    with stage("bases", "the data's own bases, of all lines of the series"):
+        settings = replace(settings, transform=found.transform(Bases(sample, settings)))
+    coding = Coding(
+        filled=True,
+        density=0,
+        bulk=goal.bulk,
+        passes=2 if config.effort > 2 else 1,
+        rounds=2,
+        rough=True,
+    )
+    task.parts.begin("quantiser step")
+    with stage("step", "coder and step, by coding some parts"):
+        parts = coded_parts(task, tiled, settings.step)
+        settings, coding, outcome, moved = _coded(task, settings, coding, tiled, parts, found.size)
+        settings = refit(sample, settings)
+        settings = with_mask(task, parts, settings, goal.expected_error)
+    attempt = Attempt(
+        sample=sample,
+        settings=settings,
+        outcome=outcome,
+        coding=coding,
+        tiling=tiling,
+        quick=True,
+    )
+    return attempt, parts, moved
+
+
+def _filled(sample: Sample, settings: TileSettings) -> Sample:
+    """Return a sample filled for the usual transform."""
+    usual = replace(settings, transform=usual_transform(sample.blocks.tile))
+    return sample.filled(usual, 1)
+
+
+ROWS = 4
+"""Distance in y of the rows that a part's cost is taken from."""
+
+
+def part_costs(task: PlanTask, blocks: Blocks, step: float) -> list[float]:
+    """Return the approximate bits of each tile, by the differences of neighbours along x."""
+
+    def cost(index: Index) -> float:
+        values = blocks.read(index).values[:, :, ::ROWS].astype(np.float32)
+        with np.errstate(all="ignore"):
+            bits = np.log2(1 + np.abs(np.diff(values, axis=3)) * np.float32(1 / step))
+        return float(np.nansum(bits, dtype=np.float64))
+
+    return list(task.workers.map(cost, blocks.indices()))
+
+
+def _parts(
+    task: PlanTask, settings: TileSettings, part_of: Callable[[Shape, int], Shape], larger: int
+) -> Sample:
+    """Return a sample of parts of a series by their costs; a small series is one part.
+
+    larger: vertices of each part, and of all, as a multiple of the usual ones.
+    """
+    shape, vertices = task.blocks.shape, larger * PRICED_VERTICES
+    one = prod(shape) <= vertices
+    blocks = task.blocks.retile(shape if one else part_of(shape, larger * PART_VERTICES))
+    costs = part_costs(task, blocks, settings.step)
+    vertices = max(vertices, prod(blocks.tile))
+    sample = Sample(blocks, vertices, task.workers, costs, task.parts.tick)
+    # Present values are priced as they are; where there is none, something must stand.
+    usual = replace(settings, transform=usual_transform(blocks.tile))
+    return sample.filled(usual, 0)
+
+
+def _candidates(task: PlanTask) -> list[Shape]:
+    """Return the tiles that a series may have."""
+    shape = task.blocks.shape
+    if task.fixed_tile is not None:
+        return [task.fixed_tile]
+    if is_small(shape) and task.config.access == "balanced":
+        return [shape]
+    if prod(shape) > MAX_WHOLE_VERTICES:
+        return tiles_of_large(task.blocks)
+    return tiles_to_try(shape, MAX_WHOLE_VERTICES, slabs=True)
+
+
+def coded_parts(task: PlanTask, tiled: Blocks, step: float) -> Sample:
+    """Return the parts of the tiles that are coded."""
+    blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
+    costs = part_costs(task, blocks, step)
+    return Sample(blocks, CODED_VERTICES, task.workers, costs, task.parts.tick)
+
+
+def _coded(
+    task: PlanTask,
+    settings: TileSettings,
+    coding: Coding,
+    tiled: Blocks,
+    parts: Sample,
+    size: float,
+) -> tuple[TileSettings, Coding, Outcome, TileSettings]:
+    """Return settings and coding of the better coder at the step that should keep the promise.
+
+    Beside them are what is expected of all tiles, and the settings of the parts.
+
+    settings: of the plain quantiser.
+    parts: coded for the choice.
+    size: bytes of all tiles by price.
+    """
+    goal = task.goal
+    if allows_trellis(settings, goal, task.config.effort):
+        settings, coding = on_trellis(settings, coding)
+    moved = moved_transform(parts, settings)
+    ways = [coding]
+    if not task.blocks.complete:
+        ways.append(replace(coding, filled=False, density=FILLING))
+    outcomes = parts.run_all([(moved, goal.bounded(way)) for way in ways])
+    outcome, coding = min(
+        zip(outcomes, ways, strict=True), key=lambda pair: _at_promise(pair[0], goal)
+    )
+    if task.is_slow(tiled.tile, size):
+        faster = replace(coding, fast=True)
+        other = parts.run(moved, goal.bounded(faster))
+        ratio = _at_promise(other, goal) / max(_at_promise(outcome, goal), 1.0)
+        most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
+        tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
+        if ratio <= most:
+            coding, outcome = faster, other
+    if goal.psnr is None:
+        return settings, coding, outcome, moved
+    step = _step(task, settings, moved, tiled, parts, outcome)
+    octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
+    vertices = tiled.counted_vertices
+    expected = Outcome(
+        size=round(outcome.size * 2**-octaves),
+        squares=squared_error(vertices, goal.psnr, goal.data_range),
+        count=vertices,
+        max_error=outcome.max_error,
+    )
+    return with_step(settings, step, goal), coding, expected, moved
+
+
+def _at_promise(outcome: Outcome, goal: Goal) -> float:
+    """Return the bytes at a promised PSNR, by the usual exchange rate of dB for bytes."""
+    if goal.psnr is None:
+        return outcome.size
+    missing = goal.psnr - outcome.psnr(goal.data_range)
+    return float(outcome.size * 2 ** (missing / EXCHANGE))
+
+
+PEER_NS = (44.0, 58.0)
+"""Nanoseconds in which a vertex may be decoded, and more for each of its bits: twice SPERR's."""
+
+
+def most_by_fast_coder(bits: float, access: str) -> float:
+    """Return the bytes that the fast coder may take, as a multiple of those of the other one.
+
+    They grow from 1 on with the time by which the other one is slower than is wished for.
+
+    bits: of a vertex.
+    """
+    most = FAST_BYTES[access]
+    if most < 1 or access != "balanced":
+        return most
+    late = decoding_ns(bits, "mixing") / (PEER_NS[0] + PEER_NS[1] * bits)
+    return min(max(1 + 2 * (most - 1) * (late - 1), 1.0), most)
+
+
+def _step(
+    task: PlanTask,
+    settings: TileSettings,
+    moved: TileSettings,
+    tiled: Blocks,
+    parts: Sample,
+    outcome: Outcome,
+) -> float:
+    """Return the step at which all tiles should have the promised error, by their coefficients.
+
+    What coefficients foretell is corrected by the true error of coded parts.
+
+    moved: settings of these parts.
+    outcome: of the parts.
+    """
+    goal = task.goal
+    assert goal.psnr is not None
+    series = magnitudes_of_all(tiled, settings, task.workers)
+    few = [magnitudes_of(tile.values, moved) for tile in parts.tiles]
+    foretold = sum(
+        weight * one.error(settings.step) for weight, one in zip(parts.weights, few, strict=True)
+    )
+    least = goal.data_range * MIN_STEP_SHARE
+    if not (foretold > 0 and outcome.squares > 0):
+        even = squared_error(prod(tiled.shape), goal.even_psnr or goal.psnr, goal.data_range)
+        return series.step(even, least)
+    error = squared_error(tiled.counted_vertices, goal.psnr, goal.data_range)
+    step = series.step(error * foretold / outcome.squares, least)
+    if outcome.bulk_squares == 0:
+        return step
+    error *= outcome.bulk_count / max(outcome.count, 1)
+    return min(step, series.step(error * foretold / outcome.bulk_squares, least))
+
+
+def with_head(task: PlanTask, attempt: Attempt, parts: Sample, moved: TileSettings) -> Attempt:
+    """Return the plan with a head where coded parts foretell that one pays.
+
+    parts: some parts of the tiles.
+    moved: their settings.
+    """
+    if reason := without_head(task, attempt):
+        skip("head", reason)
+        return attempt
+    with stage("head trial", "gain of least squares on some parts"):
+        pairs = training_pairs(parts, moved, attempt.coding)
+        low, high = attempt.settings.low, attempt.settings.high
+        gain = foretold_gain(pairs, low, high, task.config.seed)
+    if gain < LEAST_GAIN:
+        skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
+        return attempt
+    task.parts.begin("head")
+    return try_head(task, _on_all_tiles(task, attempt))
+
+
+def _on_all_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return an attempt whose outcome is that of all tiles, or of many where a series is large."""
+    if attempt.tried:
+        return attempt
+    vertices = prod(task.blocks.shape)
+    most = MAX_SEARCHED_VERTICES if vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
+    blocks = attempt.sample.blocks
+    costs = part_costs(task, blocks, attempt.settings.step)
+    sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
+    outcome = sample.run(attempt.settings, task.goal.bounded(attempt.coding))
+    return replace(attempt, sample=sample, outcome=outcome, tried=[outcome])

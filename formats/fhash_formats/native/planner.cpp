@@ -1,0 +1,623 @@
+// The planner: tiles, transform and step of a series by prices of some of its parts.
+//
+// Nothing is coded. A price is what the fast coder would take for the coefficients of a part, and
+// their squared error (fast.cpp). All trials are priced on a quarter of the parts, and those that
+// come near the cheapest on all of them.
+#include <algorithm>
+#include <cmath>
+#include <map>
+
+#include "basis.hpp"
+#include "encode.hpp"
+#include "kernels.hpp"
+#include "planner.hpp"
+#include "priors.hpp"
+
+namespace fhash {
+namespace {
+
+constexpr double WEIGHT = 0.09;       // squared steps that a bit is worth
+constexpr double ERROR_PRICE = 0.8;   // squared error in squared steps that is worth a byte
+constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a packed basis
+constexpr double NEAR = 1.02;         // of the cheapest on few parts: then all parts are priced
+constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
+constexpr double SLOPE = 5.5;         // dB by which the PSNR falls for a step larger by e
+constexpr double TILE_BYTES = 100;    // of each further tile: its place, and its coder's beginning
+
+// Parts of a series that have one shape.
+struct Block {
+    std::vector<float> values;
+    std::vector<uint8_t> counted;  // empty where all count
+    double weight;                 // vertices of the box that one of its vertices stands for
+    double share = 1;              // of its vertices that count
+};
+struct Blocks {
+    Shape shape;
+    std::vector<Block> all;
+};
+
+struct Price {
+    double bytes = 0, squares = 0, count = 0;
+
+    double mean_square() const { return count > 0 ? squares / count : 0; }
+};
+
+int bit_length(int64_t n) {
+    int bits = 0;
+    for (; n; n >>= 1) bits++;
+    return bits;
+}
+
+// The kind and the levels of a transform along an axis, whatever its length.
+struct Kind {
+    int kind = NONE_KIND, depth = 0;
+
+    bool operator==(const Kind& other) const { return kind == other.kind && depth == other.depth; }
+};
+using Kinds = std::array<Kind, 4>;
+
+AxisTransform wavelet(int kind, int depth, int64_t length) {
+    AxisTransform axis;
+    axis.depth = std::min(depth, length > 1 ? bit_length(length - 1) : 0);
+    axis.kind = axis.depth ? kind : NONE_KIND;
+    return axis;
+}
+
+// 9/7 along all axes, deepest in the plane.
+Kinds usual(const int64_t* shape) {
+    const int depth = std::min(4, std::max(1, bit_length(std::max(shape[2], shape[3])) - 2));
+    const Kind line = {DAUBECHIES_KIND, 2}, plane = {DAUBECHIES_KIND, depth};
+    return {line, line, plane, plane};
+}
+
+// Bytes of each of normal errors that are rounded to a quantum. sigma: their deviation in quanta.
+double rounded_bytes(double sigma) {
+    if (sigma > 8) return std::log2(sigma * std::sqrt(2 * 3.141592653589793 * 2.718281828459045)) / 8;
+    const int reach = (int)std::ceil(8 * sigma);
+    const double unit = std::sqrt(2.0) * std::max(sigma, 1e-9);
+    double bits = 0;
+    for (int i = -reach; i <= reach; i++) {
+        const double chance = (std::erf((i + 0.5) / unit) - std::erf((i - 0.5) / unit)) / 2;
+        if (chance > 0) bits -= chance * std::log2(chance);
+    }
+    return bits / 8;
+}
+
+// Blocks of one shape on which trials are priced, and those few of them that tell most.
+struct Set {
+    Blocks blocks;
+    std::vector<size_t> all, few;
+
+    const Shape& shape() const { return blocks.shape; }
+};
+
+class Planner {
+  public:
+    Planner(fhash_context& context, const fhash_plan_task& task, fhash_error& error)
+        : context_(context), task_(task), error_(error), step_(task.step) {
+        std::copy_n(task.shape, 4, box_.begin());
+    }
+
+    bool run(fhash_plan_result& result) {
+        Set columns = read(task_.columns), sheets;
+        if (task_.sheets.count) sheets = read(task_.sheets);
+        Kinds kinds = usual(box_.data());
+        if (!order(columns, kinds) || !order(sheets, kinds)) return false;
+        if (!settle(columns, kinds, 2)) return false;
+        if (!choose(columns, sheets, box_, 15, kinds) || !settle(columns, kinds, 1)) return false;
+        Shape tile;
+        if (!choose_tile(columns, sheets, kinds, tile, result)) return false;
+        if (tile != box_) {
+            const Set* const sets[2] = {&columns, &sheets};
+            Set cuts[2];
+            for (int i = 0; i < 2; i++) {
+                if (sets[i]->all.empty()) continue;
+                cuts[i].blocks = cut(sets[i]->blocks, within(sets[i]->shape(), tile));
+                cuts[i].all = cuts[i].few = numbers(cuts[i].blocks.all.size());
+            }
+            columns = std::move(cuts[0]);
+            sheets = std::move(cuts[1]);
+            if (!order(columns, kinds) || !order(sheets, kinds)) return false;
+            int axes = 0;
+            for (int a = 0; a < 4; a++) axes |= (tile[(size_t)a] != box_[(size_t)a]) << a;
+            if (!choose(columns, sheets, tile, axes, kinds)) return false;
+        }
+        Price found;
+        if (!settle(columns, kinds, 1) || !price(columns, columns.all, tile, {kinds}, &found))
+            return false;
+        for (size_t a = 0; a < 4; a++) {
+            const Kind of = kinds[a];
+            result.tile[a] = tile[a];
+            result.kinds[a] = of.kind;
+            result.depths[a] = of.depth;
+        }
+        result.step = step_;
+        result.bytes = found.bytes;
+        if (!sheets.all.empty()) {
+            if (!price(sheets, sheets.all, tile, {kinds}, &found)) return false;
+            result.bytes = std::min(result.bytes, found.bytes);
+        }
+        result.priced = priced_;
+        return true;
+    }
+
+  private:
+    fhash_context& context_;
+    const fhash_plan_task& task_;
+    fhash_error& error_;
+    Shape box_;
+    double step_;
+    int64_t priced_ = 0;
+    struct Own {
+        std::shared_ptr<const Basis> basis;
+        double bytes = 0;
+    };
+    std::map<std::pair<size_t, int64_t>, Modes> modes_;
+    std::map<std::pair<size_t, int64_t>, Own> bases_;
+    double bases_step_ = 0;  // that the bases are for
+
+    static std::vector<size_t> numbers(size_t count) {
+        std::vector<size_t> all(count);
+        for (size_t i = 0; i < count; i++) all[i] = i;
+        return all;
+    }
+
+    static Shape within(const Shape& shape, const Shape& tile) {
+        Shape inside;
+        for (size_t a = 0; a < 4; a++) inside[a] = std::min(shape[a], tile[a]);
+        return inside;
+    }
+
+    static Set read(const fhash_plan_parts& of) {
+        Set set;
+        std::copy_n(of.shape, 4, set.blocks.shape.begin());
+        const int64_t n = vertices(set.blocks.shape);
+        for (int64_t i = 0; i < of.count; i++) {
+            Block block;
+            block.values.assign(of.values + i * n, of.values + (i + 1) * n);
+            block.weight = of.weights[i];
+            if (of.counted) block.counted.assign(of.counted + i * n, of.counted + (i + 1) * n);
+            if (share(block)) set.blocks.all.push_back(std::move(block));
+        }
+        set.all = set.few = numbers(set.blocks.all.size());
+        return set;
+    }
+
+    // Sets the share of the vertices that count; whether any does.
+    static bool share(Block& block) {
+        if (block.counted.empty()) return true;
+        const auto there = std::count(block.counted.begin(), block.counted.end(), 1);
+        block.share = (double)there / (double)block.counted.size();
+        if ((size_t)there == block.counted.size()) block.counted.clear();
+        return there > 0;
+    }
+
+    // Blocks in smaller ones; the last one along an axis ends where the block ends.
+    static Blocks cut(const Blocks& parts, const Shape& shape) {
+        Blocks blocks;
+        blocks.shape = shape;
+        if (shape == parts.shape) return parts;
+        Shape counts;
+        double overlap = 1;
+        for (size_t a = 0; a < 4; a++) {
+            counts[a] = (parts.shape[a] + shape[a] - 1) / shape[a];
+            overlap *= (double)parts.shape[a] / (double)(counts[a] * shape[a]);
+        }
+        for (const Block& part : parts.all)
+            for (int64_t number = 0; number < vertices(counts); number++) {
+                Shape first;
+                int64_t rest = number;
+                for (size_t a = 4; a-- > 0;) {
+                    const int64_t place = rest % counts[a] * shape[a];
+                    first[a] = std::min(place, parts.shape[a] - shape[a]);
+                    rest /= counts[a];
+                }
+                Block block;
+                block.weight = part.weight * overlap;
+                copy_box(part.values, parts.shape, first, shape, block.values);
+                if (!part.counted.empty())
+                    copy_box(part.counted, parts.shape, first, shape, block.counted);
+                if (share(block)) blocks.all.push_back(std::move(block));
+            }
+        return blocks;
+    }
+    template <class T>
+    static void copy_box(const std::vector<T>& in, const Shape& of, const Shape& first,
+                         const Shape& shape, std::vector<T>& out) {
+        out.reserve((size_t)vertices(shape));
+        for (int64_t t = 0; t < shape[0]; t++)
+            for (int64_t z = 0; z < shape[1]; z++)
+                for (int64_t y = 0; y < shape[2]; y++) {
+                    const auto row = in.begin() + (((first[0] + t) * of[1] + first[1] + z) * of[2] +
+                                                   first[2] + y) * of[3] + first[3];
+                    out.insert(out.end(), row, row + shape[3]);
+                }
+    }
+
+    // The basis along an axis for blocks of a length, as precise as the step needs, and its bytes
+    // in the file; null where there can be none.
+    const Own& own(size_t axis, int64_t length) {
+        static const Own none;
+        if (!task_.lines[axis] || length < 2 || length > MAX_BASIS) return none;
+        if (bases_step_ != step_) bases_.clear();
+        bases_step_ = step_;
+        const auto key = std::make_pair(axis, length);
+        const auto found = bases_.find(key);
+        if (found != bases_.end()) return found->second;
+        auto modes = modes_.find(key);
+        if (modes == modes_.end()) modes = modes_.emplace(key, modes_along(axis, length)).first;
+        Buffer packed;
+        Own& made = bases_[key];
+        if (!pack_basis(modes->second, step_, packed, error_)) return none;
+        made.basis = read_basis({packed.data(), packed.data() + packed.size()}, error_);
+        made.bytes = BASIS_TEXT * (double)packed.size();
+        return made;
+    }
+
+    Modes modes_along(size_t axis, int64_t length) const {
+        const int64_t whole = box_[axis], lines = task_.line_counts[axis];
+        std::vector<double> gram((size_t)(length * length), 0.0), line((size_t)length);
+        double added = 0;
+        for (int64_t l = 0; l < lines; l++)
+            for (int64_t first = 0; first + length <= whole; first += length) {
+                const float* const from = task_.lines[axis] + l * whole + first;
+                std::copy_n(from, length, line.begin());
+                for (int64_t i = 0; i < length; i++) {
+                    double* const row = &gram[(size_t)(i * length)];
+                    const double value = line[(size_t)i];
+                    for (int64_t k = 0; k <= i; k++) row[k] += value * line[(size_t)k];
+                }
+                added += (double)length;
+            }
+        const double share = added > 0 ? (double)vertices(box_) / added : 0;  // of all lines
+        for (int64_t i = 0; i < length; i++)
+            for (int64_t k = 0; k <= i; k++) {
+                gram[(size_t)(i * length + k)] *= share;
+                gram[(size_t)(k * length + i)] = gram[(size_t)(i * length + k)];
+            }
+        return modes_of(gram, length);
+    }
+
+    // The transform of a shape, and what its bases take for tiles of another one.
+    double fit(const Kinds& kinds, const Shape& shape, const Shape& tile, AxisTransform* axes) {
+        double bytes = 0;
+        for (size_t a = 0; a < 4; a++) {
+            const Own* made = nullptr;
+            if (kinds[a].kind == KLT_KIND && (made = &own(a, shape[a]))->basis) {
+                axes[a].kind = KLT_KIND;
+                axes[a].basis = made->basis;
+                bytes += own(a, tile[a]).bytes;
+            } else if (kinds[a].kind != KLT_KIND) {
+                axes[a] = wavelet(kinds[a].kind, kinds[a].depth, shape[a]);
+            }
+        }
+        if (kinds[2] == kinds[3] && kinds[2].depth && std::min(shape[2], shape[3]) > 1) {
+            const int most = bit_length(std::max(shape[2], shape[3]) - 1);
+            axes[2].kind = axes[3].kind = kinds[2].kind;
+            axes[2].depth = axes[3].depth = std::min(kinds[2].depth, most);
+        }
+        return bytes;
+    }
+
+    // Prices of transforms on blocks; for all that these stand for. The costs are with the bytes of
+    // bases for tiles of a shape.
+    bool price(const Set& set, const std::vector<size_t>& which, const Shape& tile,
+               const std::vector<Kinds>& trials, Price* prices) {
+        const Blocks& blocks = set.blocks;
+        std::vector<Settings> settings(trials.size());
+        for (size_t i = 0; i < trials.size(); i++) {
+            prices[i] = {};
+            prices[i].bytes = fit(trials[i], blocks.shape, tile, settings[i].axes);
+        }
+        const size_t jobs = trials.size() * which.size();
+        std::vector<double> results(2 * jobs);
+        std::atomic<size_t> next{0};
+        std::atomic<bool> failed{false};
+        const auto work = [&](int) {
+            std::vector<float> coefficients;
+            fhash_error error;
+            error.status = FHASH_OK;
+            for (size_t job = next++; job < jobs && !failed; job = next++) {
+                const Settings& of = settings[job / which.size()];
+                const Block& block = blocks.all[which[job % which.size()]];
+                const auto plan = forward_plan<float>(context_, of, blocks.shape, error);
+                if (!plan) {
+                    failed = true;
+                    return;
+                }
+                coefficients.resize(block.values.size());
+                const FastPrior& prior = fast_prior();
+                const int64_t bands = (int64_t)plan->table.size() / TABLE_COLUMNS;
+                if (plan->transform(block.values.data(), coefficients.data()) < 0 ||
+                    fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
+                                      blocks.shape.data(), plan->table.data(), bands,
+                                      prior.slots.data(), prior.defaults.data(), nullptr, 0,
+                                      &results[2 * job]) < 0)
+                    failed = true;
+            }
+        };
+        together((int)std::min<size_t>((size_t)context_.threads, std::max<size_t>(jobs, 1)), work);
+        priced_ += (int64_t)jobs;
+        if (failed) return fail(error_, FHASH_ERROR_MEMORY, "a price could not be computed");
+        const double n = (double)vertices(blocks.shape);
+        for (size_t job = 0; job < jobs; job++) {
+            const Block& block = blocks.all[which[job % which.size()]];
+            Price& of = prices[job / which.size()];
+            const double squares = results[2 * job + 1] * step_ * step_;
+            double bytes = results[2 * job];
+            if (task_.error > 0)
+                bytes += n * rounded_bytes(std::sqrt(squares / n) / (2 * task_.error));
+            of.bytes += block.weight * bytes;
+            of.squares += block.weight * block.share * squares;
+            of.count += block.weight * block.share * n;
+        }
+        return true;
+    }
+
+    double cost(const Price& price) const {
+        return price.bytes +
+               (task_.error > 0 ? 0 : price.squares / (ERROR_PRICE * step_ * step_));
+    }
+
+    // Chooses the blocks of the most bytes, on which all trials are priced first.
+    bool order(Set& set, const Kinds& kinds) {
+        set.few = set.all;
+        if (!task_.halves || set.all.size() < 4) return true;
+        std::vector<std::pair<double, size_t>> costs;
+        for (const size_t number : set.all) {
+            Price one;
+            if (!price(set, {number}, set.shape(), {kinds}, &one)) return false;
+            costs.emplace_back(-one.bytes, number);
+        }
+        std::sort(costs.begin(), costs.end());
+        set.few.clear();
+        for (size_t i = 0; i < (costs.size() + 3) / 4; i++) set.few.push_back(costs[i].second);
+        std::sort(set.few.begin(), set.few.end());
+        return true;
+    }
+
+    // Takes the cheapest of some transforms, among which the present one is.
+    bool improve(const Set& set, const Shape& tile, const std::vector<Kinds>& changes,
+                 Kinds& kinds) {
+        std::vector<Kinds> trials = {kinds};
+        for (const Kinds& other : changes)
+            if (std::find(trials.begin(), trials.end(), other) == trials.end())
+                trials.push_back(other);
+        if (trials.size() == 1) return true;
+        std::vector<Price> prices(trials.size());
+        const auto run = [&](const std::vector<size_t>& which) {
+            return price(set, which, tile, trials, prices.data());
+        };
+        const auto least = [&] {
+            double lowest = cost(prices[0]);
+            for (const Price& one : prices) lowest = std::min(lowest, cost(one));
+            return lowest;
+        };
+        if (set.few.size() < set.all.size()) {
+            if (!run(set.few)) return false;
+            const double limit = NEAR * least();
+            std::vector<Kinds> near;
+            for (size_t i = 0; i < trials.size(); i++)
+                if (i == 0 || cost(prices[i]) <= limit) near.push_back(trials[i]);
+            trials = near;
+            prices.resize(trials.size());
+        }
+        if (trials.size() == 1) return true;
+        if (!run(set.all)) return false;
+        const double lowest = least();
+        for (size_t i = 0; i < trials.size(); i++)
+            if (cost(prices[i]) == lowest) {
+                kinds = trials[i];
+                break;
+            }
+        return true;
+    }
+
+    // The transform of the lowest price for tiles of a shape. First kinds are tried, and then other
+    // depths of the best one.
+    //
+    // axes: along which a choice is made, a bit each; y and x go together.
+    bool choose(const Set& columns, const Set& sheets, const Shape& tile, int axes, Kinds& kinds) {
+        const Set& of_plane = sheets.all.empty() ? columns : sheets;
+        const Kind plane = {DAUBECHIES_KIND, usual(tile.data())[2].depth};
+        const Kind line = {DAUBECHIES_KIND, 2};
+        if (axes & 12 && !choose_along(of_plane, tile, 2, {plane, {HAAR_KIND, 3}, {LEGALL_KIND, 2}},
+                                       kinds))
+            return false;
+        const Kind along_z = kinds[1];
+        for (size_t axis = 0; axis < 2; axis++)
+            if (axes >> axis & 1 && tile[axis] > 1 &&
+                !choose_along(columns, tile, axis, {{}, line, {HAAR_KIND, 2}, {LEGALL_KIND, 1}}, kinds))
+                return false;
+        if (kinds[1] == along_z || tile[0] == 1) return true;
+        std::vector<Kinds> changes(1, kinds);
+        changes[0][0] = {};
+        return improve(columns, tile, changes, kinds);
+    }
+
+    bool choose_along(const Set& set, const Shape& tile, size_t axis,
+                      const std::vector<Kind>& options, Kinds& kinds) {
+        std::vector<Kinds> changes;
+        const size_t last = axis == 2 ? 3 : axis;
+        const auto add = [&](Kind kind) {
+            for (size_t a = axis; a <= last; a++)
+                if (kind.depth > 0 && 1 << (kind.depth - 1) >= std::max(tile[a], tile[last]))
+                    return;
+            changes.push_back(kinds);
+            for (size_t a = axis; a <= last; a++) changes.back()[a] = kind;
+        };
+        for (const Kind& kind : options) add(kind);
+        bool may = true;
+        for (size_t a = axis; a <= last; a++)
+            may = may && own(a, set.shape()[a]).basis && own(a, tile[a]).basis;
+        if (may) add({KLT_KIND, 0});
+        if (!improve(set, tile, changes, kinds)) return false;
+        const Kind found = kinds[axis];
+        if (found.kind == NONE_KIND || found.kind == KLT_KIND) return true;
+        changes.clear();
+        if (found.depth > 1) add({found.kind, found.depth - 1});
+        add({found.kind, found.depth + 1});
+        return improve(set, tile, changes, kinds);
+    }
+
+    // Looks for the step that keeps the promise.
+    bool settle(const Set& set, const Kinds& kinds, int tries) {
+        if (task_.error > 0) return settle_bound(set, kinds);
+        double slope = SLOPE, before_log = 0, before = 0;
+        for (int i = 0; i < tries; i++) {
+            Price found;
+            if (!price(set, set.all, set.shape(), {kinds}, &found)) return false;
+            double change;  // of the logarithm of the step
+            if (task_.bytes > 0) {
+                change = std::log(std::max(found.bytes, 1.0) / task_.bytes) * 0.8;
+            } else if (task_.mean_square > 0 && found.mean_square() > 0) {
+                const double missing = 10 * std::log10(found.mean_square() / task_.mean_square);
+                const double at = std::log(step_);
+                if (i > 0 && std::fabs(at - before_log) > 0.01)
+                    slope = std::min(std::max((missing - before) / (at - before_log), 2.0), 12.0);
+                before = missing;
+                before_log = at;
+                change = -missing / slope;
+            } else {
+                return true;
+            }
+            step_ *= std::exp(std::min(std::max(change, -2.0), 2.0));
+        }
+        return true;
+    }
+
+    // The step that costs least under a bound, of some in thirds of an octave.
+    bool settle_bound(const Set& set, const Kinds& kinds) {
+        std::map<int, double> costs;
+        const auto cost_at = [&](int number, double& found) {
+            const auto known = costs.find(number);
+            if (known != costs.end()) return found = known->second, true;
+            step_ = task_.error * std::exp2(number / 3.0);
+            Price at;
+            if (!price(set, set.few, set.shape(), {kinds}, &at)) return false;
+            return found = costs[number] = cost(at), true;
+        };
+        constexpr int LAST = 15;
+        int best = (int)std::lround(3 * std::log2(std::max(step_ / task_.error, 1.0)));
+        best = std::min(best, LAST);
+        for (bool moved = true; moved;) {
+            moved = false;
+            double least, other;
+            if (!cost_at(best, least)) return false;
+            for (const int next : {best + 1, best - 1}) {
+                if (next < 0 || next > LAST) continue;
+                if (!cost_at(next, other)) return false;
+                if (other < least) {
+                    best = next;
+                    moved = true;
+                    break;
+                }
+            }
+        }
+        step_ = task_.error * std::exp2(best / 3.0);
+        return true;
+    }
+
+    // Prices tiles of fewer steps, each with the transform along time that is best for them: what
+    // few steps have in common tells nothing of more of them.
+    bool price_steps(const Set& columns, const Kinds& kinds, std::map<int64_t, double>& ratios) {
+        Set few;
+        few.blocks.shape = columns.shape();
+        for (const size_t number : columns.few) few.blocks.all.push_back(columns.blocks.all[number]);
+        few.all = few.few = numbers(few.blocks.all.size());
+        Price whole;
+        if (!price(few, few.all, few.shape(), {kinds}, &whole)) return false;
+        for (int64_t i = 0; i < task_.tile_count; i++) {
+            const int64_t length = task_.tiles[4 * i];
+            if (length >= columns.shape()[0] || ratios.count(length)) continue;
+            Set parts;
+            Shape shape = few.shape();
+            shape[0] = length;
+            parts.blocks = cut(few.blocks, shape);
+            parts.all = parts.few = numbers(parts.blocks.all.size());
+            Kinds best = kinds;
+            if (length > 1 && !choose_along(parts, shape, 0, {{}, {DAUBECHIES_KIND, 2}, {HAAR_KIND, 2}}, best))
+                return false;
+            Price found;
+            if (!price(parts, parts.all, shape, {best}, &found)) return false;
+            ratios[length] = cost(found) / cost(whole);
+        }
+        return true;
+    }
+
+    // The tile of the least burden, by what cuts of the parts along each axis cost.
+    bool choose_tile(const Set& columns, const Set& sheets, const Kinds& kinds, Shape& tile,
+                     fhash_plan_result& result) {
+        result.price = 1;
+        result.tried = 0;
+        if (task_.tile_count == 1) return std::copy_n(task_.tiles, 4, tile.begin()), true;
+        Price whole;
+        double extra[4] = {0, 0, 0, 0};  // share of bytes that a cut costs, times the length
+        double bytes = 1e300;
+        for (int of_plane = 0; of_plane < 2; of_plane++) {
+            const Set& set = of_plane && !sheets.all.empty() ? sheets : columns;
+            if (!price(set, set.all, box_, {kinds}, &whole)) return false;
+            bytes = std::min(bytes, std::max(whole.bytes, 1.0));
+            const double uncut = cost(whole);
+            for (size_t a = of_plane ? 2 : 0; a < (of_plane ? 4 : 2); a++) {
+                const int64_t n = set.shape()[a];
+                if (n < 2) continue;
+                Set halves;
+                Shape half = set.shape();
+                half[a] = (n + 1) / 2;
+                halves.blocks = cut(set.blocks, half);
+                halves.all = numbers(halves.blocks.all.size());
+                Price found;
+                if (!price(halves, halves.all, half, {kinds}, &found)) return false;
+                result.tried++;
+                const double ratio = cost(found) / uncut, length = (double)box_[a];
+                const double there = 1 / (double)half[a] - 1 / length;
+                const double before = 1 / (double)n - 1 / length;
+                extra[a] = std::max((ratio - 1) / std::max(there - ratio * before, 0.1 / n), 0.0);
+            }
+        }
+        const double ns = task_.vertex_ns + task_.bit_ns * 8 * bytes / (double)vertices(box_);
+        std::map<int64_t, double> steps;  // ratios of costs by the steps of a tile
+        if (!price_steps(columns, kinds, steps)) return false;
+        std::vector<double> prices;
+        for (int64_t i = 0; i < task_.tile_count; i++) {
+            double product = 1, count = 1;
+            for (size_t a = 0; a < 4; a++) {
+                const double n = (double)task_.tiles[4 * i + (int64_t)a], length = (double)box_[a];
+                const auto exact = steps.find(task_.tiles[4 * i + (int64_t)a]);
+                product *= a == 0 && exact != steps.end()
+                               ? exact->second * (1 + extra[0] * (1 / (double)columns.shape()[0] - 1 / length))
+                               : 1 + extra[a] * (1 / n - 1 / length);
+                count *= std::ceil(length / n);
+            }
+            prices.push_back(product + TILE_BYTES * (count - 1) / bytes);
+        }
+        const double lowest = *std::min_element(prices.begin(), prices.end());
+        double least = 1e300;
+        for (int64_t i = 0; i < task_.tile_count; i++) {
+            const double told = prices[(size_t)i] / lowest;
+            const double work = task_.works[i], late = work * ns / task_.region_ns;
+            const double burden = std::log(told) + task_.worth * std::log2(work) +
+                                  std::log2(std::max(late, 1.0));
+            if (told > task_.most || burden >= least) continue;
+            least = burden;
+            std::copy_n(task_.tiles + 4 * i, 4, tile.begin());
+            result.price = told;
+        }
+        return true;
+    }
+};
+
+}  // namespace
+}  // namespace fhash
+
+using namespace fhash;
+
+// Plans a series. The result has no bases: the caller fits them to all lines of the series.
+FHASH_KERNEL int32_t fhash_plan(fhash_context* context, const fhash_plan_task* task,
+                                fhash_plan_result* result, fhash_error* error) {
+    return reported(error, [&](fhash_error& failed) {
+        Planner planner(*context, *task, failed);
+        return planner.run(*result) && failed.status == FHASH_OK;
+    });
+}
