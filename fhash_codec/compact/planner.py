@@ -84,6 +84,8 @@ CODED_VERTICES = 1 << 19
 """Vertices of all parts that are coded: a single one foretold a wrong coder."""
 FILLING = 2
 """Thoroughness (density) of the filling that competes with the present values of a feature."""
+AIM = 0.02
+"""dB above the promise that the step is for: all tiles are coded again where they fall short."""
 LINES = 2048
 """Lines along an axis that its own basis is foretold by, some for each of its vertices."""
 
@@ -485,7 +487,7 @@ def _coded(
         return settings, coding, outcome, moved
     step = _step(task, settings, moved, tiled, parts, outcome)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
-    vertices = tiled.counted_vertices
+    vertices = prod(tiled.shape)
     expected = Outcome(
         size=round(outcome.size * 2**-octaves),
         squares=squared_error(vertices, goal.psnr, goal.data_range),
@@ -547,7 +549,7 @@ def _step(
     if not (foretold > 0 and outcome.squares > 0):
         even = squared_error(prod(tiled.shape), goal.even_psnr or goal.psnr, goal.data_range)
         return series.step(even, least)
-    error = squared_error(tiled.counted_vertices, goal.psnr, goal.data_range)
+    error = squared_error(prod(tiled.shape), goal.psnr + AIM, goal.data_range)
     step = series.step(error * foretold / outcome.squares, least)
     if outcome.bulk_squares == 0:
         return step

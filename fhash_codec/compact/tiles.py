@@ -236,11 +236,6 @@ class Blocks:
             yield frames if mask is None else frames[mask]
 
     @property
-    def counted_vertices(self) -> int:
-        """Number of vertices of the box over all steps that are in the coreset."""
-        return self._extent.samples
-
-    @property
     def values_in_memory(self) -> Values:
         """Values (t, z, y, x) of the box over all steps, less the origin, which stay in memory."""
         return self._whole().values

@@ -523,7 +523,7 @@ class Planner {
     bool price_steps(const Set& columns, const Kinds& kinds, std::map<int64_t, double>& ratios) {
         Set few;
         few.blocks.shape = columns.shape();
-        for (const size_t number : columns.few) few.blocks.all.push_back(columns.blocks.all[number]);
+        for (const size_t number : columns.all) few.blocks.all.push_back(columns.blocks.all[number]);
         few.all = few.few = numbers(few.blocks.all.size());
         Price whole;
         if (!price(few, few.all, few.shape(), {kinds}, &whole)) return false;
