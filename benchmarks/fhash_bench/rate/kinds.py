@@ -83,10 +83,8 @@ def _field(
     the longest waves. times: of the steps, 0 to 1; even ones if None.
     """
     steps, *space = lengths
-    longest = max(space)
-    rates = [np.fft.fftfreq(n) * longest for n in space[:-1]] + [
-        np.fft.rfftfreq(space[-1], 1 / longest)
-    ]
+    spacing = 1 / max(space)
+    rates = [*(np.fft.fftfreq(n, spacing) for n in space[:-1]), np.fft.rfftfreq(space[-1], spacing)]
     z, y, x = np.meshgrid(*rates, indexing="ij", sparse=True)
     number = np.sqrt(z**2 + y**2 + x**2)
     number[0, 0, 0] = np.inf
@@ -217,8 +215,8 @@ KINDS: dict[str, Kind] = {
     "mixing": Kind(make=_mixing, chosen=False, every_goal=True),
     "noise": Kind(make=_noise, chosen=False, every_goal=True),
     "counts": Kind(make=_counts, chosen=False),
-    "thin": Kind(make=_of_waves(40, 1, 128, 160), chosen=False),
-    "thin-3": Kind(make=_of_waves(20, 3, 96, 112), chosen=False),
+    "thin": Kind(make=_of_waves(40, 1, 128, 160, power=2.0), chosen=False),
+    "thin-3": Kind(make=_of_waves(20, 3, 96, 112, power=2.0), chosen=False),
     "uneven": Kind(make=_uneven, chosen=False),
     "feature-shell": Kind(make=_feature_shell, chosen=False),
     "feature-fifth": Kind(make=_feature_fifth, chosen=False),
@@ -227,7 +225,7 @@ KINDS: dict[str, Kind] = {
     "shock": Kind(make=_shock, chosen=True, every_goal=True),
     "wind": Kind(make=_of_waves(12, 20, 100, 100), chosen=True, every_goal=True),
     "labels": Kind(make=_labels, chosen=True),
-    "many": Kind(make=_of_waves(600, 1, 24, 24, span=8.0), chosen=True),
+    "many": Kind(make=_of_waves(600, 1, 24, 24, power=2.0, span=8.0), chosen=True),
     "feature-blob": Kind(make=_feature_blob, chosen=True),
     "missing": Kind(make=_missing, chosen=True),
     "single": Kind(make=_of_waves(4, 16, 32, 32, span=0.3), chosen=True),

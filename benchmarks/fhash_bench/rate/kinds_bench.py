@@ -181,7 +181,7 @@ def bench_kinds(
     for kind in kinds:
         if kind not in KINDS:
             raise InputError(f"'{kind}' is no kind; {suggestion(kind, KINDS)}")
-    chosen = [
+    wanted = [
         name
         for name, kind in KINDS.items()
         if (name in kinds if kinds else large or not kind.large)
@@ -196,12 +196,12 @@ def bench_kinds(
             coders.append(stack.enter_context(Coder(BESIDE, Path(beside).resolve(), folder)))
         run, cases = _Run(coders, peers, repeat, folder), []
         run.warm_up()
-        for number, name in enumerate(chosen):
+        for number, name in enumerate(wanted):
             values, settings = KINDS[name].series(name, scale)
             for goal in (settings, *(EVERY_GOAL if KINDS[name].every_goal else ())):
-                progress("measuring", number, len(chosen), f"{name}, {goal_name(goal)}")
+                progress("measuring", number, len(wanted), f"{name}, {goal_name(goal)}")
                 cases.append(run.case(name, KINDS[name], values, goal))
-        progress("measuring", len(chosen), len(chosen), "")
+        progress("measuring", len(wanted), len(wanted), "")
         return KindsBench(
             cases=tuple(cases),
             commits={coder.name: commit_of(coder.package) for coder in coders},
@@ -434,7 +434,7 @@ def spectrum_error(frame: Double, error: Double) -> float:
 
     frame, error: NaN where no vertex is counted, which becomes the mean.
     """
-    rates = [np.fft.fftfreq(n) * max(frame.shape) for n in frame.shape]
+    rates = [np.fft.fftfreq(n, 1 / max(frame.shape)) for n in frame.shape]
     squares = sum(each**2 for each in np.meshgrid(*rates, indexing="ij", sparse=True))
     bins = np.rint(np.sqrt(squares)).astype(np.int64).ravel()
     rest = np.nan_to_num(frame - np.nanmean(frame))
