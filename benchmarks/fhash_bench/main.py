@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from fhash_bench.commands.paper import paper
-from fhash_bench.commands.rate import labels, rate, rate_table
+from fhash_bench.commands.rate import kinds, labels, rate, rate_table
 from fhash_bench.commands.render import render
 from fhash_bench.commands.train import ablate, train
 from fhash_cli.options import BaseGroup
@@ -16,5 +16,5 @@ def command() -> None:
     """Measure speed and size on this machine."""
 
 
-for _bench in (ablate, labels, paper, rate, render, rate_table, train):
+for _bench in (ablate, kinds, labels, paper, rate, render, rate_table, train):
     command.add_command(_bench)

@@ -46,6 +46,10 @@ def test_bench_ablate(fhash: Fhash, data: Path) -> None:
     check("bench ablate", parsed(fhash(*words, "--json", "-q")))
 
 
+def test_bench_kinds(fhash: Fhash) -> None:
+    check("bench kinds", parsed(fhash("bench", "kinds", "--only", "single", "--json", "-q")))
+
+
 def test_bench_labels(fhash: Fhash) -> None:
     words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
     check("bench labels", parsed(fhash(*words, "--json", "-q")))

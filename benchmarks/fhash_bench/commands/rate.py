@@ -1,4 +1,4 @@
-"""The commands `fhash bench rate`, `table` and `labels`: options, and results as text."""
+"""The commands `fhash bench rate`, `table`, `labels` and `kinds`: options, and results as text."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from fhash_cli.options import (
     RealRange,
     SourceOptions,
     TextType,
+    check_writable,
     force_option,
     json_option,
     quiet_option,
@@ -28,6 +29,7 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 
 if TYPE_CHECKING:
     from fhash_bench.labels import LabelBench
+    from fhash_bench.rate.kinds_bench import KindsBench
     from fhash_bench.rate.measuring import RateBench
     from fhash_bench.rate.table import RateCell, RateTable
 
@@ -521,3 +523,143 @@ def _text(result: LabelBench) -> str:
         for size in result.sizes
     ]
     return "\n".join([table([header, *rows]), "", *result.notes])
+
+
+def _kinds() -> Sequence[str]:
+    from fhash_bench.rate.kinds import KINDS
+
+    return list(KINDS)
+
+
+def _filters() -> Sequence[str]:
+    from fhash_bench.rate.kinds_bench import FILTERS
+
+    return (*FILTERS, NONE)
+
+
+@click.command(
+    "kinds",
+    cls=BaseCommand,
+    short_help="size, speed and quality on many kinds of made data, beside another checkout",
+    epilog="fhash bench kinds --only single --only labels",
+)
+@click.option(
+    "--only",
+    "kinds",
+    type=one_of("kind", _kinds),
+    multiple=True,
+    help="A kind, such as shock; repeat. Default: all that take seconds.",
+)
+@click.option("--large", is_flag=True, help="Add the kind large, 300 MB of float32.")
+@click.option(
+    "--beside",
+    metavar="DIR",
+    type=click.Path(exists=True, file_okay=False),
+    help="Another checkout that is built in place, or a folder site-packages with fhash: the same"
+    " kinds, in turns.",
+)
+@click.option(
+    "--peer",
+    "peers",
+    type=one_of("peer", _filters),
+    multiple=True,
+    help="SPERR, SZ3 or none; repeat. Default: both.",
+)
+@click.option(
+    "--repeat",
+    type=click.IntRange(1, 100),
+    metavar="N",
+    default=1,
+    show_default=True,
+    help="Runs of encoding and decoding, of which the fastest counts.",
+)
+@click.option(
+    "-o",
+    "record",
+    metavar="FILE.json",
+    type=click.Path(dir_okay=False),
+    help="Keep what --json prints.",
+)
+@force_option
+@json_option
+@quiet_option
+def kinds(
+    kinds: tuple[str, ...],
+    large: bool,
+    beside: str | None,
+    peers: tuple[str, ...],
+    repeat: int,
+    record: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Measure fhash on kinds of data that NumPy makes, to decide about the encoder.
+
+    Choices of the encoder are made on half of the kinds; the others are only reported, and come
+    first. All are encoded with the default promise or one of their own, and some also at 45 dB,
+    60 dB and within 0.1 % of the range. SPERR and SZ3 come with pip install 'fhash[bench]'.
+    """
+    if record is not None:
+        check_writable(record, force)
+    with Progress(quiet=quiet) as progress:
+        from fhash_bench.kept import save
+        from fhash_bench.rate.kinds_bench import FILTERS, bench_kinds
+
+        result = bench_kinds(
+            kinds,
+            beside=beside,
+            names=[name for name in dict.fromkeys(peers or FILTERS) if name != NONE],
+            repeat=repeat,
+            large=large,
+            progress=progress,
+        )
+    if record is not None:
+        save(Path(record), result.to_dict())
+    emit(result.to_dict(), _kinds_text(result), as_json)
+
+
+def _kinds_text(result: KindsBench) -> str:
+    """Figures of each kind, how they were measured, and ratios to other coders."""
+    header = ("kind", "use", "goal", "coder", "bytes", "encode s", "decode s", "region ms")
+    rows = [(*header, "kept", "PSNR", "gradient", "spectrum", "seams")]
+    for case in result.cases:
+        for row in case.figures:
+            rows.append(
+                (
+                    case.kind,
+                    _use(case.chosen),
+                    case.goal,
+                    row.coder,
+                    f"{row.bytes:,}",
+                    number(row.encode_seconds, digits=3),
+                    number(row.decode_seconds, digits=3),
+                    number(row.region_ms, digits=3),
+                    "yes" if row.kept else "NO",
+                    number(row.psnr),
+                    number(row.gradient_psnr),
+                    number(100 * row.spectrum_error, "%", digits=2),
+                    number(row.seams, digits=3),
+                )
+            )
+    ratios = [("fhash / other", "use", "figure", "mean", "worst", "where")]
+    ratios += [
+        (
+            row["coder"],
+            _use(row["chosen"]),
+            row["measure"].replace("_seconds", ""),
+            number(row["mean"]),
+            number(row["worst"]),
+            row["case"],
+        )
+        for row in result.ratios()
+    ]
+    refused = [f"not measured: {case}: {reason}" for case, reason in result.refused.items()]
+    commits = [f"{coder}: {commit or 'no commit'}" for coder, commit in result.commits.items()]
+    lines = [table(rows), "", *result.notes, *refused, *commits, "", table(ratios)]
+    return "\n".join(lines)
+
+
+def _use(chosen: bool) -> str:
+    """The part of a kind in decisions about the encoder."""
+    return "chosen on" if chosen else "reported"
