@@ -46,7 +46,6 @@ from fhash_codec.compact.stages import (
     plateau_center,
     try_head,
     try_predictor,
-    with_mask,
     without_head,
 )
 from fhash_codec.compact.step import allows_trellis, on_trellis, with_step
@@ -59,7 +58,6 @@ from fhash_codec.compact.transform import (
     moved_transform,
     refit,
     squared_error,
-    usual_transform,
 )
 from fhash_codec.progress import skip, stage, tell
 from fhash_formats.support.values import Single
@@ -78,12 +76,12 @@ OF_PLATEAU = 4
 Thin shells take all of the bytes, and small parts hold little of them (a shock took 1.3 times the
 bytes).
 """
+BLOCK_VERTICES = 5 << 19
+"""Vertices of the block on which the price of cuts is checked."""
 CODED_PART = 1 << 18
 """Vertices of a part that is coded."""
 CODED_VERTICES = 1 << 19
 """Vertices of all parts that are coded: a single one foretold a wrong coder."""
-FILLING = 2
-"""Thoroughness (density) of the filling that competes with the present values of a feature."""
 AIM = 0.02
 """dB above the promise that the step is for: all tiles are coded again where they fall short."""
 LINES = 2048
@@ -121,14 +119,25 @@ def column_of(shape: Shape, vertices: int) -> Shape:
     return t, z, y, x
 
 
+def block_of(shape: Shape, vertices: int) -> Shape:
+    """Return a part of a box that is as long as may be along all axes: the longest are halved."""
+    lengths = list(shape)
+    while prod(lengths) > vertices:
+        axis = max(range(4), key=lambda number: (lengths[number], number))
+        lengths[axis] = (lengths[axis] + 1) // 2
+    t, z, y, x = lengths
+    return t, z, y, x
+
+
 def is_priced(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool:
-    """Whether a series is planned by prices: those know no size yet."""
+    """Whether a series is planned by prices: those know neither features nor a size yet."""
     goal = task.goal
     return (
         task.config.effort > 1
         and (goal.psnr is not None or (goal.error is not None and not goal.lossless))
         and goal.data_range > 0
         and tiled.in_memory
+        and tiled.complete
         and not settings.double
         and not task.config.without
     )
@@ -153,6 +162,7 @@ class _Task(ctypes.Structure):
         ("shape", ctypes.c_int64 * 4),
         ("columns", _Parts),
         ("sheets", _Parts),
+        ("block", _Parts),
         ("lines", ctypes.c_void_p * 4),
         ("line_counts", ctypes.c_int64 * 4),
         ("tiles", ctypes.c_void_p),
@@ -236,12 +246,14 @@ def priced_plan(
     settings: TileSettings,
     columns: Sample,
     sheets: Sample | None,
+    block: Sample | None,
     tiles: Sequence[Shape],
 ) -> Priced:
     """Return what the planner finds.
 
     settings: centre, and the step to begin with.
     columns, sheets: parts, see `column_of` and `sheet_of`; None where columns are sheets, too.
+    block: one part, see `block_of`; None where there is nothing to choose.
     tiles: candidates.
     """
     config, goal, blocks = task.config, task.goal, task.blocks
@@ -284,6 +296,8 @@ def priced_plan(
     )
     if sheets is not None:
         given.sheets = parts(sheets)
+    if block is not None:
+        given.block = parts(block)
     whole = blocks.values_in_memory
     for axis, length in enumerate(blocks.shape):
         if length > 1:
@@ -306,29 +320,10 @@ def priced_plan(
 def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     """Return the plan of a series that `is_priced`, with the step that should keep the promise.
 
-    Where some vertices do not count, it is made once for the values that they have, and once for
-    fill values; the plan of the fewest bytes is taken.
-
     settings: with a first guess of the step.
     """
-    task.parts.begin("tiles and transform")
-    fillings = (False,) if task.blocks.complete else (False, True)
-    plans = [_plan(task, settings, filled=filled) for filled in fillings]
-    attempt, parts, moved = min(plans, key=lambda plan: plan[0].outcome.size)
-    task.gains.note("transform by trial", attempt.outcome)
-    if task.goal.psnr is not None:
-        return with_head(task, attempt, parts, moved)
-    # What a predictor competes with is no estimate.
-    attempt = try_predictor(task, _on_all_tiles(task, attempt))
-    attempt = with_head(task, attempt, parts, moved)
-    return choose_predicted(task, attempt)
-
-
-def _plan(
-    task: PlanTask, settings: TileSettings, *, filled: bool
-) -> tuple[Attempt, Sample, TileSettings]:
-    """Return a plan, coded parts of its tiles, and their settings."""
     blocks, goal, config = task.blocks, task.goal, task.config
+    task.parts.begin("tiles and transform")
     with stage("plan", "tiles, transform and step, by prices of some parts"):
         columns, larger = _parts(task, settings, column_of, 1), 1
         center = plateau_center(columns, task.value_range)
@@ -341,23 +336,16 @@ def _plan(
         if columns.blocks.tile[2:] != blocks.shape[2:]:
             sheets = _parts(task, settings, sheet_of, larger)
         settings = replace(settings, center=center)
-        if filled:
-            columns, sheets = _filled(columns, settings), sheets and _filled(sheets, settings)
-        found = priced_plan(task, settings, columns, sheets, _candidates(task))
+        tiles, block = _candidates(task), None
+        if len(tiles) > 1:
+            cut = blocks.retile(block_of(blocks.shape, BLOCK_VERTICES))
+            costs = part_costs(task, cut, settings.step)
+            block = Sample(cut, 1, task.workers, costs, task.parts.tick)
+        found = priced_plan(task, settings, columns, sheets, block, tiles)
     tiling = None
     if task.fixed_tile is None:
         tiling = Tiling(tile=found.tile, price=found.price)
         tell("plan", f"--access {config.access}: {tiling.describe()}")
-    import os
-
-    if os.environ.get("V"):
-        print(
-            "   ",
-            found,
-            columns.blocks.tile,
-            len(columns.tiles),
-            sheets and (sheets.blocks.tile, len(sheets.tiles)),
-        )
     tiled = blocks.retile(found.tile)
     sample = Sample(tiled, 1, task.workers)
     rounding = float(np.finfo(blocks.dtype).eps) / 2 if blocks.dtype.kind == "f" else 0.0
@@ -377,7 +365,7 @@ def _plan(
         parts = coded_parts(task, tiled, settings.step)
         settings, coding, outcome, moved = _coded(task, settings, coding, tiled, parts, found.size)
         settings = refit(sample, settings)
-        settings = with_mask(task, parts, settings, goal.expected_error)
+    task.gains.note("transform by trial", outcome)
     attempt = Attempt(
         sample=sample,
         settings=settings,
@@ -386,13 +374,12 @@ def _plan(
         tiling=tiling,
         quick=True,
     )
-    return attempt, parts, moved
-
-
-def _filled(sample: Sample, settings: TileSettings) -> Sample:
-    """Return a sample filled for the usual transform."""
-    usual = replace(settings, transform=usual_transform(sample.blocks.tile))
-    return sample.filled(usual, 1)
+    if goal.psnr is not None:
+        return with_head(task, attempt, parts, moved)
+    # What a predictor competes with is no estimate.
+    attempt = try_predictor(task, _on_all_tiles(task, attempt))
+    attempt = with_head(task, attempt, parts, moved)
+    return choose_predicted(task, attempt)
 
 
 ROWS = 4
@@ -423,10 +410,7 @@ def _parts(
     blocks = task.blocks.retile(shape if one else part_of(shape, larger * PART_VERTICES))
     costs = part_costs(task, blocks, settings.step)
     vertices = max(vertices, prod(blocks.tile))
-    sample = Sample(blocks, vertices, task.workers, costs, task.parts.tick)
-    # Present values are priced as they are; where there is none, something must stand.
-    usual = replace(settings, transform=usual_transform(blocks.tile))
-    return sample.filled(usual, 0)
+    return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
 
 
 def _candidates(task: PlanTask) -> list[Shape]:
@@ -468,13 +452,7 @@ def _coded(
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
     moved = moved_transform(parts, settings)
-    ways = [coding]
-    if not task.blocks.complete:
-        ways.append(replace(coding, filled=False, density=FILLING))
-    outcomes = parts.run_all([(moved, goal.bounded(way)) for way in ways])
-    outcome, coding = min(
-        zip(outcomes, ways, strict=True), key=lambda pair: _at_promise(pair[0], goal)
-    )
+    outcome = parts.run(moved, goal.bounded(coding))
     if task.is_slow(tiled.tile, size):
         faster = replace(coding, fast=True)
         other = parts.run(moved, goal.bounded(faster))

@@ -264,7 +264,7 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     coding = Coding(
         filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick, rough=quick
     )
-    settings = with_mask(task, sample, settings, task.goal.expected_error)
+    settings = _with_mask(task, sample, settings, task.goal.expected_error)
     looked = sample
     if quick and task.goal.psnr is not None:
         looked = priced(sample, settings, task.config.effort)
@@ -538,7 +538,7 @@ def _with_new_mask(
     """Return settings with scores of a mask for the error that a bound or a size leaves."""
     if task.goal.psnr is not None or not outcome.count:
         return settings
-    return with_mask(task, sample, settings, math.sqrt(outcome.squares / outcome.count))
+    return _with_mask(task, sample, settings, math.sqrt(outcome.squares / outcome.count))
 
 
 def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -702,7 +702,9 @@ def _sample(task: PlanTask, tiled: Blocks, settings: TileSettings, max_vertices:
     return Sample(tiled, max_vertices, task.workers, costs, task.parts.tick).filled(usual, 1)
 
 
-def with_mask(task: PlanTask, sample: Sample, settings: TileSettings, error: float) -> TileSettings:
+def _with_mask(
+    task: PlanTask, sample: Sample, settings: TileSettings, error: float
+) -> TileSettings:
     """Return settings with scores for the mask of the vertices that count, if there is one.
 
     error: root of the mean squared error of the decoded values, in data units.

@@ -21,7 +21,12 @@ constexpr double ERROR_PRICE = 0.8;   // squared error in squared steps that is 
 constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a packed basis
 constexpr double NEAR = 1.02;         // of the cheapest on few parts: then all parts are priced
 constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
+constexpr double OCTAVES = 0.67;      // of bytes for an octave of squared errors: 4.5 dB an octave
 constexpr double SLOPE = 5.5;         // dB by which the PSNR falls for a step larger by e
+constexpr double LEAST_EXTRA = 0.002;  // share of extra bytes that a block corrects
+constexpr double LEAST_TOLD = 0.5;    // bytes of cuts along an axis, as a multiple
+constexpr double MOST_FACTOR = 8;     // of the extra bytes that thin parts foretell
+constexpr size_t MOST_CHECKS = 4;     // tilings that the block is cut into
 constexpr double TILE_BYTES = 100;    // of each further tile: its place, and its coder's beginning
 
 // Parts of a series that have one shape.
@@ -147,7 +152,7 @@ class Planner {
     fhash_error& error_;
     Shape box_;
     double step_;
-    int64_t priced_ = 0;
+    int64_t priced_ = 0, tried_ = 0;
     struct Own {
         std::shared_ptr<const Basis> basis;
         double bytes = 0;
@@ -359,6 +364,13 @@ class Planner {
                (task_.error > 0 ? 0 : price.squares / (ERROR_PRICE * step_ * step_));
     }
 
+    // Bytes at equal quality as a multiple of those of another price of the same values.
+    double relative(const Price& one, const Price& other) const {
+        const double bytes = one.bytes / std::max(other.bytes, 1.0);
+        if (task_.error > 0 || one.squares <= 0 || other.squares <= 0) return bytes;
+        return bytes * std::pow(one.squares / other.squares, OCTAVES);
+    }
+
     // Chooses the blocks of the most bytes, on which all trials are priced first.
     bool order(Set& set, const Kinds& kinds) {
         set.few = set.all;
@@ -518,79 +530,101 @@ class Planner {
         return true;
     }
 
-    // Prices tiles of fewer steps, each with the transform along time that is best for them: what
-    // few steps have in common tells nothing of more of them.
-    bool price_steps(const Set& columns, const Kinds& kinds, std::map<int64_t, double>& ratios) {
-        Set few;
-        few.blocks.shape = columns.shape();
-        for (const size_t number : columns.all) few.blocks.all.push_back(columns.blocks.all[number]);
-        few.all = few.few = numbers(few.blocks.all.size());
-        Price whole;
-        if (!price(few, few.all, few.shape(), {kinds}, &whole)) return false;
-        for (int64_t i = 0; i < task_.tile_count; i++) {
-            const int64_t length = task_.tiles[4 * i];
-            if (length >= columns.shape()[0] || ratios.count(length)) continue;
-            Set parts;
-            Shape shape = few.shape();
-            shape[0] = length;
-            parts.blocks = cut(few.blocks, shape);
-            parts.all = parts.few = numbers(parts.blocks.all.size());
-            Kinds best = kinds;
-            if (length > 1 && !choose_along(parts, shape, 0, {{}, {DAUBECHIES_KIND, 2}, {HAAR_KIND, 2}}, best))
-                return false;
-            Price found;
-            if (!price(parts, parts.all, shape, {best}, &found)) return false;
-            ratios[length] = cost(found) / cost(whole);
+    // What cuts cost.
+    struct Cuts {
+        double extra[4] = {0, 0, 0, 0};  // share of bytes along each axis, times the length
+        // Bytes of tiles of fewer steps than the columns have, as a multiple, and their transform.
+        std::map<int64_t, std::pair<double, Kind>> steps;
+        int64_t columns = 1;               // steps of these
+        double factors[4] = {1, 1, 1, 1};  // of the extra bytes, by the block
+
+        // Bytes of tiles of a shape as a multiple of those of one tile.
+        double told(const Shape& shape, const Shape& box) const {
+            double product = 1;
+            for (size_t a = 0; a < 4; a++) {
+                const auto known = a == 0 ? steps.find(shape[0]) : steps.end();
+                const double n = (double)(known == steps.end() ? shape[a] : columns);
+                double along = 1 + extra[a] * (1 / n - 1 / (double)box[a]);
+                if (known != steps.end()) along *= known->second.first;
+                product *= std::max(1 + factors[a] * (along - 1), LEAST_TOLD);
+            }
+            return product;
+        }
+    };
+
+    // Prices cuts of parts along each axis. Tiles of fewer steps are priced each with the transform
+    // along time that is best for them: what few steps have in common tells nothing of more.
+    bool price_cuts(const Set& columns, const Set& sheets, const Kinds& kinds, Cuts& cuts,
+                    double& bytes) {
+        cuts.columns = columns.shape()[0];
+        bytes = 1e300;
+        for (int of_plane = 0; of_plane < 2; of_plane++) {
+            const Set& set = of_plane && !sheets.all.empty() ? sheets : columns;
+            Price whole;
+            if (!price(set, set.all, box_, {kinds}, &whole)) return false;
+            bytes = std::min(bytes, std::max(whole.bytes, 1.0));
+            for (size_t a = of_plane ? 2 : 0; a < (of_plane ? 4 : 2); a++) {
+                const int64_t n = set.shape()[a];
+                if (n < 2) continue;
+                Shape half = set.shape();
+                half[a] = (n + 1) / 2;
+                double ratio;
+                if (!price_ratio(set, half, kinds, whole, ratio)) return false;
+                const double length = (double)box_[a], before = 1 / (double)n - 1 / length;
+                const double there = 1 / (double)half[a] - 1 / length;
+                cuts.extra[a] =
+                    std::max((ratio - 1) / std::max(there - ratio * before, 0.1 / (double)n), 0.0);
+            }
+            for (int64_t i = 0; i < task_.tile_count && !of_plane; i++) {
+                const int64_t length = task_.tiles[4 * i];
+                if (length >= cuts.columns || cuts.steps.count(length)) continue;
+                const Set few = cut_set(columns, {length, set.shape()[1], set.shape()[2],
+                                                  set.shape()[3]});
+                Kinds best = kinds;
+                const std::vector<Kind> options = {{}, {DAUBECHIES_KIND, 2}, {HAAR_KIND, 2}};
+                if (length > 1 && !choose_along(few, few.shape(), 0, options, best)) return false;
+                Price found;
+                if (!price(few, few.all, few.shape(), {best}, &found)) return false;
+                cuts.steps[length] = {relative(found, whole), best[0]};
+            }
         }
         return true;
     }
 
-    // The tile of the least burden, by what cuts of the parts along each axis cost.
-    bool choose_tile(const Set& columns, const Set& sheets, const Kinds& kinds, Shape& tile,
-                     fhash_plan_result& result) {
-        result.price = 1;
-        result.tried = 0;
-        if (task_.tile_count == 1) return std::copy_n(task_.tiles, 4, tile.begin()), true;
-        Price whole;
-        double extra[4] = {0, 0, 0, 0};  // share of bytes that a cut costs, times the length
-        double bytes = 1e300;
-        for (int of_plane = 0; of_plane < 2; of_plane++) {
-            const Set& set = of_plane && !sheets.all.empty() ? sheets : columns;
-            if (!price(set, set.all, box_, {kinds}, &whole)) return false;
-            bytes = std::min(bytes, std::max(whole.bytes, 1.0));
-            const double uncut = cost(whole);
-            for (size_t a = of_plane ? 2 : 0; a < (of_plane ? 4 : 2); a++) {
-                const int64_t n = set.shape()[a];
-                if (n < 2) continue;
-                Set halves;
-                Shape half = set.shape();
-                half[a] = (n + 1) / 2;
-                halves.blocks = cut(set.blocks, half);
-                halves.all = numbers(halves.blocks.all.size());
-                Price found;
-                if (!price(halves, halves.all, half, {kinds}, &found)) return false;
-                result.tried++;
-                const double ratio = cost(found) / uncut, length = (double)box_[a];
-                const double there = 1 / (double)half[a] - 1 / length;
-                const double before = 1 / (double)n - 1 / length;
-                extra[a] = std::max((ratio - 1) / std::max(there - ratio * before, 0.1 / n), 0.0);
-            }
-        }
+    static Set cut_set(const Set& set, const Shape& shape) {
+        Set parts;
+        parts.blocks = cut(set.blocks, shape);
+        parts.all = parts.few = numbers(parts.blocks.all.size());
+        return parts;
+    }
+
+    // The cost of parts in blocks of a shape as a multiple of another one.
+    bool price_ratio(const Set& set, const Shape& shape, const Kinds& kinds, const Price& uncut,
+                     double& ratio) {
+        const Set parts = cut_set(set, shape);
+        Price found;
+        if (!price(parts, parts.all, shape, {kinds}, &found)) return false;
+        ratio = relative(found, uncut);
+        tried_++;
+        return true;
+    }
+
+    // The tile of the least burden. checked: costs of the block in blocks of a shape, as a multiple;
+    // only: whether no other tile may be taken.
+    void least_burden(const Cuts& cuts, const Shape& block, const std::map<Shape, double>& checked,
+                      bool only, double bytes, Shape& tile, double& price) const {
         const double ns = task_.vertex_ns + task_.bit_ns * 8 * bytes / (double)vertices(box_);
-        std::map<int64_t, double> steps;  // ratios of costs by the steps of a tile
-        if (!price_steps(columns, kinds, steps)) return false;
         std::vector<double> prices;
         for (int64_t i = 0; i < task_.tile_count; i++) {
-            double product = 1, count = 1;
-            for (size_t a = 0; a < 4; a++) {
-                const double n = (double)task_.tiles[4 * i + (int64_t)a], length = (double)box_[a];
-                const auto exact = steps.find(task_.tiles[4 * i + (int64_t)a]);
-                product *= a == 0 && exact != steps.end()
-                               ? exact->second * (1 + extra[0] * (1 / (double)columns.shape()[0] - 1 / length))
-                               : 1 + extra[a] * (1 / n - 1 / length);
-                count *= std::ceil(length / n);
-            }
-            prices.push_back(product + TILE_BYTES * (count - 1) / bytes);
+            Shape shape;
+            std::copy_n(task_.tiles + 4 * i, 4, shape.begin());
+            double count = 1, told = cuts.told(shape, box_);
+            for (size_t a = 0; a < 4; a++) count *= std::ceil((double)box_[a] / (double)shape[a]);
+            const auto known = checked.find(within(block, shape));
+            if (known != checked.end())
+                told *= known->second * cuts.told(block, box_) / cuts.told(known->first, box_);
+            else if (only) told = 1e9;
+            prices.push_back(told + TILE_BYTES * (count - 1) / bytes);
         }
         const double lowest = *std::min_element(prices.begin(), prices.end());
         double least = 1e300;
@@ -602,8 +636,40 @@ class Planner {
             if (told > task_.most || burden >= least) continue;
             least = burden;
             std::copy_n(task_.tiles + 4 * i, 4, tile.begin());
-            result.price = told;
+            price = told;
         }
+    }
+
+    // The tile of the least burden by what cuts cost. Thin parts tell too little of that, since
+    // other axes are cut already: what they foretell of a tile is checked on a large block.
+    bool choose_tile(const Set& columns, const Set& sheets, const Kinds& kinds, Shape& tile,
+                     fhash_plan_result& result) {
+        result.price = 1;
+        if (task_.tile_count == 1) return std::copy_n(task_.tiles, 4, tile.begin()), true;
+        Cuts cuts;
+        double bytes;
+        if (!price_cuts(columns, sheets, kinds, cuts, bytes)) return false;
+        const Set block = read(task_.block);
+        Price whole;
+        std::map<Shape, double> checked = {{block.shape(), 1.0}};
+        for (bool only = false;; only = checked.size() > MOST_CHECKS) {
+            least_burden(cuts, block.shape(), checked, only, bytes, tile, result.price);
+            const Shape inside = within(block.shape(), tile);
+            if (block.all.empty() || checked.count(inside)) break;
+            if (whole.count == 0 && !price(block, block.all, box_, {kinds}, &whole)) return false;
+            Kinds of = kinds;
+            const auto steps = cuts.steps.find(inside[0]);
+            if (steps != cuts.steps.end()) of[0] = steps->second.second;
+            double ratio;
+            if (!price_ratio(block, inside, of, whole, ratio)) return false;
+            checked[inside] = ratio;
+            const double told = cuts.told(inside, box_) / cuts.told(block.shape(), box_);
+            if (told < 1 + LEAST_EXTRA || ratio < told) continue;
+            for (size_t a = 0; a < 4; a++)
+                if (inside[a] < block.shape()[a])
+                    cuts.factors[a] *= std::min((ratio - 1) / (told - 1), MOST_FACTOR);
+        }
+        result.tried = tried_;
         return true;
     }
 };

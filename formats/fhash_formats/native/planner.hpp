@@ -17,6 +17,7 @@ typedef struct fhash_plan_task {
     int64_t shape[4];           /* of the box over all steps, t, z, y, x */
     fhash_plan_parts columns;   /* as long as the box along t and z, where they can */
     fhash_plan_parts sheets;    /* as long along y and x; count 0 where the columns are, too */
+    fhash_plan_parts block;     /* one, as long along all axes as may be */
     const float* lines[4];  /* lines along each axis (count, shape[axis]); NULL where no basis may be */
     int64_t line_counts[4];
     const int64_t* tiles;   /* candidates (count, 4) */
