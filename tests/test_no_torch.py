@@ -21,13 +21,13 @@ import json, sys
 from dataclasses import replace
 from click.testing import CliRunner
 from fhash_cli.main import program
-from fhash_codec.compact import head
+from fhash_codec.compact import head, planner
 
 budget = head.Budget(updates=80, samples=8192)
-trial = replace(head.EFFORTS[5].trial, budget=budget)
 # A head is trained, whether it pays or not.
-any_size = {"least": -1e6, "least_bytes": 0, "most_bits": 1e6}
-head.EFFORTS[5] = replace(head.EFFORTS[5], trial=trial, perceptron=budget, **any_size)
+head.LEAST_GAIN = planner.LEAST_GAIN = -1e6
+head.likely_heads = lambda *_: [head.PERCEPTRON]
+head.EFFORTS[5] = replace(head.EFFORTS[5], perceptron=budget)
 for line in sys.stdin:
     result = CliRunner().invoke(program, json.loads(line))
     print(json.dumps([result.exit_code, result.stdout, result.stderr]))

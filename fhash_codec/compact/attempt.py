@@ -206,6 +206,8 @@ class Tiling:
     """Bytes of the tilings that were tried, at the quality of the first."""
     parts: list[Shape] = field(default_factory=list)
     """Shapes of the parts that the tilings were tried on; none for the whole series."""
+    tried: int = 0
+    """Number of tilings that were priced, where none was coded."""
     found: tuple[TileSettings, Outcome] | None = None
     """Settings of these tiles, with a good transform and step, and what was foretold of them; None
     where the whole series was not tried with them."""
@@ -218,7 +220,8 @@ class Tiling:
     def describe(self) -> str:
         """Return the tilings that were tried, with their prices, as one line."""
         if not self.trials:
-            return f"foretold: {self.price:.2f} times the bytes of one tile"
+            priced = f"priced {self.tried} tilings" if self.tried else "foretold"
+            return f"{priced}: {self.price:.2f} times the bytes of the best one"
         least = min(self.trials.values())
         told = ", ".join(
             f"{' x '.join(map(str, tile))} at {size / least:.2f}"

@@ -17,6 +17,8 @@ import numpy.typing as npt
 from fhash_codec.compact.attempt import HeadHistory, region_vertices
 from fhash_codec.compact.goal import (
     EXCHANGE,
+    FINEST_PSNR,
+    MAX_STEP_SHARE,
     RATIO_SLACK,
     SLOPE,
     Goal,
@@ -24,19 +26,15 @@ from fhash_codec.compact.goal import (
     goal_of,
     integer_goal,
     promise,
+    psnr_search,
+    require_reach,
     search,
+    with_step,
 )
 from fhash_codec.compact.head import HEAD_BYTES
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT
-from fhash_codec.compact.step import (
-    FINEST_PSNR,
-    MAX_STEP_SHARE,
-    psnr_search,
-    require_reach,
-    with_step,
-)
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
@@ -142,7 +140,7 @@ def tiling_header(table: CodedTable, *, timings: bool, quick: bool) -> dict[str,
         record = {
             "price": round(tiling.price, 3),
             "best": list(tiling.best or table.plan.blocks.shape),
-            "tried": len(tiling.trials),
+            "tried": len(tiling.trials) or tiling.tried,
         }
     if table.plan.coding.fast:
         record["coder"] = "fast"

@@ -10,7 +10,7 @@ from threading import Event
 from typing import NamedTuple
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
-from fhash_codec.compact.goal import step_after_gain
+from fhash_codec.compact.goal import EXACT, octave_gain, step_after_gain
 from fhash_codec.compact.head_training import (
     Budget,
     Pair,
@@ -20,7 +20,6 @@ from fhash_codec.compact.head_training import (
     train_head,
 )
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.step import EXACT, octave_gain
 from fhash_codec.compact.tiles import Coding, Outcome
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.support.threads import at_most, usable_threads

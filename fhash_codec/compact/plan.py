@@ -22,8 +22,13 @@ from fhash_codec.compact.attempt import (
     first_tile,
     parse_tile,
 )
-from fhash_codec.compact.goal import Goal, integer_goal
-from fhash_codec.compact.planner import is_priced, plan_by_prices
+from fhash_codec.compact.goal import Goal, integer_goal, with_step
+from fhash_codec.compact.planner import (
+    is_nearly_exact,
+    is_priced,
+    on_all_tiles,
+    plan_by_prices,
+)
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import (
     choose_predicted,
@@ -36,7 +41,6 @@ from fhash_codec.compact.stages import (
     try_head,
     try_predictor,
 )
-from fhash_codec.compact.step import with_step
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile
 from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import estimated_size, estimated_step, usual_transform
@@ -200,7 +204,7 @@ def with_step_of(trial: LabelTrial, guess: Attempt) -> LabelTrial:
     guess: its outcome has the promise that is not an exact one.
     """
     mask = trial.attempt.settings.mask
-    settings = replace(guess.settings, labels=True, mask=mask)
+    settings = replace(guess.settings, labels=True, mask=mask, head=None, predictor=None)
     coding = replace(trial.attempt.coding, bulk=guess.coding.bulk)
     return replace(trial, attempt=replace(trial.attempt, settings=settings, coding=coding))
 
@@ -256,8 +260,6 @@ MAX_BYTES_KEPT = 128 << 20
 """Largest size of the box over all steps, in bytes, whose decoded values effort 1 keeps."""
 LIKELY = 1.5
 """Ratio of labels to the rest up to which tiles are chosen for labels, which may then win."""
-ROUNDING_ERROR = 12**-0.5
-"""Root of the mean squared error of rounding to integers, in data units."""
 NEARLY = 0.5
 """Distance in dB that a sample may be below a promise that all tiles then keep."""
 OVERHEAD_BYTES = 2000
@@ -342,18 +344,8 @@ def plan(
 
 
 def _may_be_exact(task: PlanTask, found: CodingPlan) -> bool:
-    """Whether exact integers may take fewer bytes than a PSNR that leaves hardly any error.
-
-    Decoded values are rounded to integers. Below the error of that rounding, hardly any step of the
-    quantiser gives the PSNR: a little finer, and all values are exact.
-    """
-    return (
-        task.goal.psnr is not None
-        and task.blocks.dtype.kind in "iu"
-        and found.size is not None
-        and not found.settings.labels
-        and task.goal.expected_error < ROUNDING_ERROR
-    )
+    """Whether exact integers may take fewer bytes than a PSNR that leaves hardly any error."""
+    return is_nearly_exact(task) and found.size is not None and not found.settings.labels
 
 
 def _planned(task: PlanTask, tiled: Blocks) -> CodingPlan:
@@ -396,6 +388,8 @@ def _by_trial(
         if trial is not None and ends_trials(trial, attempt.outcome.size):
             return _label_plan(task, tiled_labels(task, trial))
         attempt = _improved(task, attempt)
+    elif trial is not None and trial.attempt.outcome.size <= LIKELY * attempt.outcome.size:
+        attempt = on_all_tiles(task, attempt)  # what labels compete with is no estimate
     settings = attempt.settings
     if trial is not None and trial.attempt.outcome.size <= LIKELY * attempt.outcome.size:
         labelled = tiled_labels(task, trial)

@@ -34,7 +34,7 @@ from fhash_codec.compact.attempt import (
     sub_tile,
     tiles_to_try,
 )
-from fhash_codec.compact.goal import EXCHANGE, SLOPE, Goal
+from fhash_codec.compact.goal import EXCHANGE, SLOPE, Goal, allows_trellis, on_trellis, with_step
 from fhash_codec.compact.head import LEAST_GAIN, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample
@@ -48,7 +48,6 @@ from fhash_codec.compact.stages import (
     try_predictor,
     without_head,
 )
-from fhash_codec.compact.step import allows_trellis, on_trellis, with_step
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome
 from fhash_codec.compact.tilings import tiles_of_large
 from fhash_codec.compact.transform import (
@@ -82,6 +81,12 @@ CODED_PART = 1 << 18
 """Vertices of a part that is coded."""
 CODED_VERTICES = 1 << 19
 """Vertices of all parts that are coded: a single one foretold a wrong coder."""
+LOOKS = 3
+"""Times that parts are coded for the step at most."""
+FARTHEST = 3.0
+"""Factor by which the step changes at most from one look to the next."""
+NEAR = 0.35
+"""Change of the logarithm of the step, 2 dB, up to which no further look is needed."""
 AIM = 0.02
 """dB above the promise that the step is for: all tiles are coded again where they fall short."""
 LINES = 2048
@@ -129,6 +134,23 @@ def block_of(shape: Shape, vertices: int) -> Shape:
     return t, z, y, x
 
 
+ROUNDING_ERROR = 12**-0.5
+"""Root of the mean squared error of rounding to integers, in data units."""
+
+
+def is_nearly_exact(task: PlanTask) -> bool:
+    """Whether a PSNR leaves integers less error than rounding, so that exact ones may be smaller.
+
+    Below the error of that rounding, hardly any step of the quantiser gives the PSNR: a little
+    finer, and all values are exact.
+    """
+    return (
+        task.goal.psnr is not None
+        and task.blocks.dtype.kind in "iu"
+        and task.goal.expected_error < ROUNDING_ERROR
+    )
+
+
 def is_priced(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool:
     """Whether a series is planned by prices: those know neither features nor a size yet."""
     goal = task.goal
@@ -140,6 +162,7 @@ def is_priced(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool:
         and tiled.complete
         and not settings.double
         and not task.config.without
+        and not is_nearly_exact(task)
     )
 
 
@@ -199,7 +222,7 @@ class _Result(ctypes.Structure):
 
 @dataclass(frozen=True, kw_only=True)
 class Priced:
-    """What the planner has found.
+    """Plan of the native planner.
 
     Attributes:
         tile: shape of the tiles.
@@ -207,6 +230,7 @@ class Priced:
         step: of the plain quantiser, in data units.
         size: bytes of all tiles, by price.
         price: bytes of the tiling, as a multiple of the fewest.
+        tried: number of tilings that were priced.
     """
 
     tile: Shape
@@ -214,6 +238,7 @@ class Priced:
     step: float
     size: float
     price: float
+    tried: int
 
     def transform(self, bases: Bases) -> TransformSpec:
         """Return the transform, with bases of the data's own where it has some."""
@@ -314,6 +339,7 @@ def priced_plan(
         step=found.step,
         size=found.bytes,
         price=found.price,
+        tried=found.tried,
     )
 
 
@@ -344,7 +370,7 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
         found = priced_plan(task, settings, columns, sheets, block, tiles)
     tiling = None
     if task.fixed_tile is None:
-        tiling = Tiling(tile=found.tile, price=found.price)
+        tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
         tell("plan", f"--access {config.access}: {tiling.describe()}")
     tiled = blocks.retile(found.tile)
     sample = Sample(tiled, 1, task.workers)
@@ -377,7 +403,7 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     if goal.psnr is not None:
         return with_head(task, attempt, parts, moved)
     # What a predictor competes with is no estimate.
-    attempt = try_predictor(task, _on_all_tiles(task, attempt))
+    attempt = try_predictor(task, on_all_tiles(task, attempt))
     attempt = with_head(task, attempt, parts, moved)
     return choose_predicted(task, attempt)
 
@@ -463,7 +489,17 @@ def _coded(
             coding, outcome = faster, other
     if goal.psnr is None:
         return settings, coding, outcome, moved
-    step = _step(task, settings, moved, tiled, parts, outcome)
+    for _ in range(LOOKS):
+        step = _step(task, settings, moved, tiled, parts, outcome)
+        change = min(max(step / settings.step, 1 / FARTHEST), FARTHEST)
+        if abs(math.log(change)) < NEAR:
+            break
+        # So far from where it was measured, coefficients foretell the error badly.
+        settings = with_step(settings, change * settings.step, goal)
+        moved = moved_transform(parts, replace(moved, step=settings.step, double=settings.double))
+        outcome = parts.run(moved, goal.bounded(coding))
+    else:
+        step = _step(task, settings, moved, tiled, parts, outcome)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
     vertices = prod(tiled.shape)
     expected = Outcome(
@@ -552,10 +588,10 @@ def with_head(task: PlanTask, attempt: Attempt, parts: Sample, moved: TileSettin
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
     task.parts.begin("head")
-    return try_head(task, _on_all_tiles(task, attempt))
+    return try_head(task, on_all_tiles(task, attempt))
 
 
-def _on_all_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
+def on_all_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     """Return an attempt whose outcome is that of all tiles, or of many where a series is large."""
     if attempt.tried:
         return attempt

@@ -11,14 +11,12 @@ from operator import itemgetter
 import numpy as np
 
 from fhash_codec.compact.attempt import FAST_BYTES, Attempt, PlanTask, Tiling, sub_tile
-from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
-from fhash_codec.compact.head import choose_head
-from fhash_codec.compact.predictor import choose_predictor
-from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, mask_levels, priced
-from fhash_codec.compact.step import (
+from fhash_codec.compact.goal import (
     EXACT,
+    EXCHANGE,
     NEAR,
     QUICK,
+    Goal,
     Precision,
     allows_trellis,
     find_step,
@@ -27,8 +25,12 @@ from fhash_codec.compact.step import (
     on_trellis,
     require_reach,
     step_after,
+    step_after_gain,
     with_step,
 )
+from fhash_codec.compact.head import choose_head
+from fhash_codec.compact.predictor import choose_predictor
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, mask_levels, priced
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (

@@ -22,9 +22,8 @@ from fhash_codec.compact.attempt import (
     region_vertices,
     tiles_to_try,
 )
-from fhash_codec.compact.goal import EXCHANGE, exchange, step_after_gain
+from fhash_codec.compact.goal import EXCHANGE, exchange, find_step, step_after, step_after_gain
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced, strata
-from fhash_codec.compact.step import find_step, step_after
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
     MAX_BASIS_LENGTH,

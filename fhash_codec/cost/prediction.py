@@ -15,7 +15,7 @@ from typing import Annotated, TypedDict
 import numpy as np
 
 from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
-from fhash_codec.compact.goal import EXCHANGE
+from fhash_codec.compact.goal import EXCHANGE, allows_trellis
 from fhash_codec.compact.head import (
     EFFORTS,
     GAIN_OF_HEAD,
@@ -38,7 +38,6 @@ from fhash_codec.compact.stages import (
     is_tried_in_parts,
     vertices_of_trials,
 )
-from fhash_codec.compact.step import allows_trellis
 from fhash_codec.compact.tilings import PICKED_VERTICES, largest_tile
 from fhash_codec.compact.transform import CODED, basis_bytes, count_trials
 from fhash_codec.comparison import ssim_budget

@@ -22,7 +22,7 @@ from fhash_codec.compact.attempt import (
     first_tile,
     parse_tile,
 )
-from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.goal import find_step, goal_of
 from fhash_codec.compact.head import PERCEPTRON, training_pairs
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
@@ -37,7 +37,6 @@ from fhash_codec.compact.plan import LabelTrial, has_labels, look_at_labels
 from fhash_codec.compact.predictor import TRIAL_ROWS, IntegerTile, fit_weights
 from fhash_codec.compact.sample import Sample, priced
 from fhash_codec.compact.stages import first_guess, first_settings
-from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, code, total
 from fhash_codec.compact.transform import likely_transform, tile_costs, usual_transform
 from fhash_codec.comparison import EncodeReport
@@ -383,7 +382,7 @@ FORWARD = 1 / 3
 
 @dataclass(frozen=True, kw_only=True)
 class HeadProbe:
-    """What least squares foretell of heads, a short training of one, and rates that follow from it.
+    """Gain of heads by least squares, a short training of one, and rates that follow from it.
 
     Attributes:
         gain_db: gain in dB of least squares.

@@ -27,7 +27,7 @@ def with_head(path: Path, head: NeighbourHead) -> Path:
     def patched(*args: Any, **options: Any) -> Any:
         table = code_series(*args, **options)
         settings = replace(table.plan.settings, head=head)
-        return replace(table, plan=replace(table.plan, settings=settings))
+        return replace(table, plan=replace(table.plan, settings=settings), decoded={})
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fhash_codec.compact.encode.code_series", patched)

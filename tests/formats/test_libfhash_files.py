@@ -303,7 +303,7 @@ def test_a_region_of_a_tile_with_a_head_equals_that_part_of_the_tile(tmp_path: P
     def coded(*arguments: Any, **options: Any) -> Any:
         table = code(*arguments, **options)
         settings = replace(table.plan.settings, head=random_head())
-        return replace(table, plan=replace(table.plan, settings=settings))
+        return replace(table, plan=replace(table.plan, settings=settings), decoded={})
 
     values = np.random.default_rng(8).normal(size=(2, *SPACE)).astype(np.float32)
     config = EncodeConfig(psnr=50.0, effort=2, tile="2x16x32x16", timings=False)

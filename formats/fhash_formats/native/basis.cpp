@@ -176,7 +176,8 @@ bool pack_basis(const Modes& modes, double step, Buffer& packed, fhash_error& er
         const double* const largest = std::max_element(
             spectrum, spectrum + n, [](double a, double b) { return std::fabs(a) < std::fabs(b); });
         const double scale = (*largest > 0 ? 1.0 : -1.0) / shrink(exponent);
-        for (int64_t k = 0; k < n; k++) row[(size_t)k] = (int32_t)std::nearbyint(spectrum[k] * scale);
+        for (int64_t k = 0; k < n; k++)
+            row[(size_t)k] = (int32_t)std::nearbyint(spectrum[k] * scale);
         for (int64_t k = 0; k < n; k++) rest[(size_t)k] = row[(size_t)k];
         const double length = std::sqrt(dot(rest.data(), rest.data(), n));
         for (int pass = 0; pass < 2; pass++)  // Gram-Schmidt, repeated against rounding

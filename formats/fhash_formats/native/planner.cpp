@@ -77,7 +77,7 @@ Kinds usual(const int64_t* shape) {
 
 // Bytes of each of normal errors that are rounded to a quantum. sigma: their deviation in quanta.
 double rounded_bytes(double sigma) {
-    if (sigma > 8) return std::log2(sigma * std::sqrt(2 * 3.141592653589793 * 2.718281828459045)) / 8;
+    if (sigma > 8) return std::log2(sigma * 4.132731354122493) / 8;  // sqrt(2 pi e)
     const int reach = (int)std::ceil(8 * sigma);
     const double unit = std::sqrt(2.0) * std::max(sigma, 1e-9);
     double bits = 0;
@@ -439,7 +439,8 @@ class Planner {
         const Kind along_z = kinds[1];
         for (size_t axis = 0; axis < 2; axis++)
             if (axes >> axis & 1 && tile[axis] > 1 &&
-                !choose_along(columns, tile, axis, {{}, line, {HAAR_KIND, 2}, {LEGALL_KIND, 1}}, kinds))
+                !choose_along(columns, tile, axis,
+                              {{}, line, {HAAR_KIND, 2}, {LEGALL_KIND, 1}}, kinds))
                 return false;
         if (kinds[1] == along_z || tile[0] == 1) return true;
         std::vector<Kinds> changes(1, kinds);
@@ -609,7 +610,9 @@ class Planner {
         return true;
     }
 
-    // The tile of the least burden. checked: costs of the block in blocks of a shape, as a multiple;
+    // The tile of the least burden.
+    //
+    // checked: bytes of the block in blocks of a shape, as a multiple.
     // only: whether no other tile may be taken.
     void least_burden(const Cuts& cuts, const Shape& block, const std::map<Shape, double>& checked,
                       bool only, double bytes, Shape& tile, double& price) const {

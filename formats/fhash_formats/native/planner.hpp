@@ -9,7 +9,7 @@ typedef struct fhash_plan_parts {
     int64_t count;
     const float* values;    /* (count, shape), less the centre, finite */
     const uint8_t* counted; /* likewise: 1 where a vertex counts; NULL where all do */
-    const double* weights;  /* of each part: vertices of the box that one of its vertices stands for */
+    const double* weights;  /* of each part: vertices of the box that one of its own stands for */
 } fhash_plan_parts;
 
 /* A series and its promise. */
@@ -18,7 +18,7 @@ typedef struct fhash_plan_task {
     fhash_plan_parts columns;   /* as long as the box along t and z, where they can */
     fhash_plan_parts sheets;    /* as long along y and x; count 0 where the columns are, too */
     fhash_plan_parts block;     /* one, as long along all axes as may be */
-    const float* lines[4];  /* lines along each axis (count, shape[axis]); NULL where no basis may be */
+    const float* lines[4];      /* along each axis (count, shape[axis]); NULL for no basis */
     int64_t line_counts[4];
     const int64_t* tiles;   /* candidates (count, 4) */
     const double* works;    /* of each: vertices that are decoded for a region */

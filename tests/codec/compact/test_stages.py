@@ -33,13 +33,17 @@ from fhash_codec.compact.goal import (
     cheapest,
     decided_by_bulk,
     exchange,
+    find_step,
     geometric_mean,
     goal_of,
     held_psnr,
     missed_promise,
+    off_trellis,
+    on_trellis,
     promise,
     remarks,
     search,
+    with_step,
 )
 from fhash_codec.compact.head import EFFORTS, Budget
 from fhash_codec.compact.plan import CodingPlan, holds_beside, plan, rank_share
@@ -50,12 +54,6 @@ from fhash_codec.compact.stages import (
     coarser_bases,
     first_guess,
     first_settings,
-)
-from fhash_codec.compact.step import (
-    find_step,
-    off_trellis,
-    on_trellis,
-    with_step,
 )
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome, Tile
 from fhash_codec.compact.transform import Bases, basis_bytes, usual_transform

@@ -181,9 +181,9 @@ def test_each_setting_has_a_prediction() -> None:
 
 @pytest.mark.parametrize("effort", [4, 5, 6])
 def test_each_effort_has_a_prediction(effort: int) -> None:
-    """Efforts code alike up to 6, but each has a trial of its own head, or none."""
+    """Efforts code alike up to 6, but heads are looked at from 5 on."""
     noisy = waves() + np.random.default_rng(0).normal(0, 0.05, (6, 8, 24, 24)).astype(np.float32)
-    assert ("head trial" in only(noisy, psnr=40.0, effort=effort).stages) == (effort > 5)
+    assert ("head trial" in only(noisy, psnr=40.0, effort=effort).stages) == (effort >= 5)
 
 
 def test_only_what_an_effort_does_is_counted() -> None:

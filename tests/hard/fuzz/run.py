@@ -47,7 +47,18 @@ SOURCES = (
     *("coder", "fast", "trellis", "mask", "mask_levels", "predict", "labels"),
     *("coder_v3", "fast_v3", "trellis_v3", "mask_v3", "predict_v3", "labels_v3"),
     *("lifting", "head", "quantise", "values", "crc32c", "prior_bytes", "priors", "inflate"),
-    *("settings", "coding", "plan", "differences", "tile", "choose", "encode", "chunk", "part"),
+    *(
+        "settings",
+        "basis",
+        "coding",
+        "plan",
+        "differences",
+        "tile",
+        "choose",
+        "encode",
+        "chunk",
+        "part",
+    ),
     "files",
 )
 """Files of NATIVE that are always fuzzed."""
