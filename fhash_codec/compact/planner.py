@@ -152,10 +152,14 @@ def is_nearly_exact(task: PlanTask) -> bool:
 
 
 def is_priced(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool:
-    """Whether a series is planned by prices: those know neither features nor a size yet."""
+    """Whether a series is planned by prices.
+
+    They know neither features nor a size yet, nor do they find the fewest bytes at any cost.
+    """
     goal = task.goal
     return (
-        task.config.effort > 1
+        1 < task.config.effort <= MAX_PRICED_EFFORT
+        and task.config.access != "small"
         and (goal.psnr is not None or (goal.error is not None and not goal.lossless))
         and goal.data_range > 0
         and tiled.in_memory
@@ -317,7 +321,7 @@ def priced_plan(
         step=settings.step,
         mean_square=0.0 if goal.psnr is None else goal.expected_error**2,
         error=goal.error or 0.0,
-        halves=config.effort <= MAX_PRICED_EFFORT,
+        halves=True,
     )
     if sheets is not None:
         given.sheets = parts(sheets)
