@@ -3,7 +3,8 @@
 One loop goes from trial to trial (`search`). Where it goes, a PSNR says by secants of the log step
 (`PsnrSearch`), a number of bytes by secants within a bracket (`SizeSearch`): on a sample by
 `find_step`, on all tiles in encode.py; the error of trained tables likewise in paper/table_step.py.
-Under a bound the cheapest of a few steps is looked for (`cheapest`). Searches know no codec; `find_step` codes a sample.
+Under a bound the cheapest of a few steps is looked for (`cheapest`). Searches know no
+codec; `find_step` codes a sample.
 """
 
 from __future__ import annotations
@@ -22,11 +23,7 @@ from fhash_codec.measure.errors import is_wide, whole_psnr
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile import (
-    OFFSETS,
-    TRELLIS_WEIGHT,
-    WEIGHT,
     plain_step,
-    with_trellis,
 )
 from fhash_formats.transform.tile_format import TileSettings
 
@@ -552,31 +549,6 @@ def octave_gain(tried: Sequence[Outcome], data_range: float) -> float:
         (math.log2(outcome.size), outcome.psnr(data_range)) for outcome in tried if outcome.size
     ]
     return exchange(points, EXCHANGE)
-
-
-MIN_EFFORT = 2
-"""Least effort that uses the trellis."""
-
-
-def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
-    """Whether the trellis may be used.
-
-    Values that are exact after all have no use for it. Steps so fine that they need float64 come
-    near the finest step there is, with which the plain quantiser errs less.
-    """
-    exact = goal.error == 0 or goal.data_range <= 0
-    return effort >= MIN_EFFORT and not exact and not settings.double
-
-
-def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
-    """Return settings and coding with the trellis, at about the same error."""
-    return with_trellis(settings), replace(coding, weight=TRELLIS_WEIGHT)
-
-
-def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
-    """Return settings and coding with the plain quantiser, at about the same error."""
-    settings = replace(settings, trellis=False, step=plain_step(settings), offsets=OFFSETS)
-    return settings, replace(coding, weight=WEIGHT)
 
 
 def step_after(settings: TileSettings, outcome: Outcome, goal: Goal, slope: float = SLOPE) -> float:

@@ -34,13 +34,14 @@ from fhash_codec.compact.attempt import (
     sub_tile,
     tiles_to_try,
 )
-from fhash_codec.compact.goal import EXCHANGE, SLOPE, Goal, allows_trellis, on_trellis, with_step
+from fhash_codec.compact.goal import EXCHANGE, SLOPE, Goal, with_step
 from fhash_codec.compact.head import LEAST_GAIN, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample
 from fhash_codec.compact.stages import (
     MAX_SEARCHED_VERTICES,
     SAMPLE_VERTICES,
+    allows_trellis,
     choose_predicted,
     mean_center,
     plateau_center,
@@ -48,7 +49,7 @@ from fhash_codec.compact.stages import (
     try_predictor,
     without_head,
 )
-from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome
+from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome, on_trellis
 from fhash_codec.compact.tilings import tiles_of_large
 from fhash_codec.compact.transform import (
     Bases,
@@ -204,8 +205,6 @@ class _Task(ctypes.Structure):
         ("mean_square", ctypes.c_double),
         ("error", ctypes.c_double),
         ("bytes", ctypes.c_double),
-        ("halves", ctypes.c_int32),
-        ("reserved", ctypes.c_int32),
     )
 
 
@@ -270,6 +269,33 @@ def lines_along(values: npt.NDArray[Any], axis: int, center: float) -> Single:
     return np.ascontiguousarray(_float32(np.moveaxis(values, axis, -1)[places], center))
 
 
+class _Held:
+    """Arrays that a native call reads, kept until it is over."""
+
+    def __init__(self) -> None:
+        self._arrays: list[npt.NDArray[Any]] = []
+
+    def address(self, array: npt.NDArray[Any]) -> int:
+        """Return the address of an array."""
+        self._arrays.append(array)
+        return array.ctypes.data
+
+    def parts(self, sample: Sample, center: float) -> _Parts:
+        """Return the tiles of a sample as parts of its series."""
+        values = np.stack([_float32(tile.values, center) for tile in sample.tiles])
+        counted = None
+        if any(tile.counted is not None for tile in sample.tiles):
+            masks = [
+                np.ones(tile.values.shape, bool) if tile.counted is None else tile.counted
+                for tile in sample.tiles
+            ]
+            counted = self.address(np.stack(masks).astype(np.uint8))
+        weights = np.array(sample.weights, np.float64)
+        weights *= prod(sample.blocks.shape) / (weights.sum() * prod(values.shape[1:]))
+        shape = (ctypes.c_int64 * 4)(*values.shape[1:])
+        return _Parts(shape, len(values), self.address(values), counted, self.address(weights))
+
+
 def priced_plan(
     task: PlanTask,
     settings: TileSettings,
@@ -286,32 +312,13 @@ def priced_plan(
     tiles: candidates.
     """
     config, goal, blocks = task.config, task.goal, task.blocks
-    held: list[npt.NDArray[Any]] = []
-
-    def address(array: npt.NDArray[Any]) -> int:
-        held.append(array)
-        return array.ctypes.data
-
-    def parts(sample: Sample) -> _Parts:
-        values = np.stack([_float32(tile.values, settings.center) for tile in sample.tiles])
-        counted = None
-        if any(tile.counted is not None for tile in sample.tiles):
-            masks = (
-                np.ones(tile.values.shape, bool) if tile.counted is None else tile.counted
-                for tile in sample.tiles
-            )
-            counted = address(np.stack(list(masks)).astype(np.uint8))
-        weights = np.array(sample.weights, np.float64)
-        weights *= prod(blocks.shape) / (weights.sum() * prod(values.shape[1:]))
-        shape = (ctypes.c_int64 * 4)(*values.shape[1:])
-        return _Parts(shape, len(values), address(values), counted, address(weights))
-
+    held = _Held()
     first, more = DECODING_NS["fast"]
     given = _Task(
         shape=(ctypes.c_int64 * 4)(*blocks.shape),
-        columns=parts(columns),
-        tiles=address(np.array(tiles, np.int64)),
-        works=address(np.array([region_vertices(blocks.shape, tile) for tile in tiles])),
+        columns=held.parts(columns, settings.center),
+        tiles=held.address(np.array(tiles, np.int64)),
+        works=held.address(np.array([region_vertices(blocks.shape, tile) for tile in tiles])),
         tile_count=len(tiles),
         worth=WORTH[config.access],
         region_ns=1e6 * REGION_MS[config.access],
@@ -321,17 +328,16 @@ def priced_plan(
         step=settings.step,
         mean_square=0.0 if goal.psnr is None else goal.expected_error**2,
         error=goal.error or 0.0,
-        halves=True,
     )
     if sheets is not None:
-        given.sheets = parts(sheets)
+        given.sheets = held.parts(sheets, settings.center)
     if block is not None:
-        given.block = parts(block)
+        given.block = held.parts(block, settings.center)
     whole = blocks.values_in_memory
     for axis, length in enumerate(blocks.shape):
         if length > 1:
             lines = lines_along(whole, axis, settings.center)
-            given.lines[axis], given.line_counts[axis] = address(lines), len(lines)
+            given.lines[axis], given.line_counts[axis] = held.address(lines), len(lines)
     found = _Result()
     call_with_context("fhash_plan", ctypes.byref(given), ctypes.byref(found))
     t, z, y, x = found.tile

@@ -18,11 +18,8 @@ from fhash_codec.compact.goal import (
     QUICK,
     Goal,
     Precision,
-    allows_trellis,
     find_step,
     octave_gain,
-    off_trellis,
-    on_trellis,
     require_reach,
     step_after,
     step_after_gain,
@@ -31,7 +28,7 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, mask_levels, priced
-from fhash_codec.compact.tiles import Blocks, Coding, Outcome
+from fhash_codec.compact.tiles import Blocks, Coding, Outcome, off_trellis, on_trellis
 from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (
     adapted_transform,
@@ -220,6 +217,20 @@ LOST = 0.5
 """Distance in dB from the promise from which on bases made anew lack directions it needs."""
 SAME_STEP = 0.1
 """Difference of log steps below which bases are not made anew."""
+
+
+MIN_EFFORT = 2
+"""Least effort that uses the trellis."""
+
+
+def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
+    """Whether the trellis may be used.
+
+    Values that are exact after all have no use for it. Steps so fine that they need float64 come
+    near the finest step there is, with which the plain quantiser errs less.
+    """
+    exact = goal.error == 0 or goal.data_range <= 0
+    return effort >= MIN_EFFORT and not exact and not settings.double
 
 
 def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:

@@ -21,7 +21,17 @@ from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.threads import chunk_region, map_ahead, one_ahead, usable_threads
 from fhash_formats.support.values import Mask, Values
 from fhash_formats.transform import tile as coder
-from fhash_formats.transform.tile import WEIGHT, CodedTile, decode_tile, encode_tile, exact_tile
+from fhash_formats.transform.tile import (
+    OFFSETS,
+    TRELLIS_WEIGHT,
+    WEIGHT,
+    CodedTile,
+    decode_tile,
+    encode_tile,
+    exact_tile,
+    plain_step,
+    with_trellis,
+)
 from fhash_formats.transform.tile_format import Shape, TileSettings
 from fhash_formats.transform.values import about_origin, cast
 
@@ -333,6 +343,17 @@ class Coding(coder.Coding):
     """Whether tiles are stored without loss, by `exact_tile`; the other options are then unused."""
     bulk: BulkPart | None = None
     """Part of the promise about the bulk, which changes what is measured and no byte."""
+
+
+def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
+    """Return settings and coding with the trellis, at about the same error."""
+    return with_trellis(settings), replace(coding, weight=TRELLIS_WEIGHT)
+
+
+def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
+    """Return settings and coding with the plain quantiser, at about the same error."""
+    settings = replace(settings, trellis=False, step=plain_step(settings), offsets=OFFSETS)
+    return settings, replace(coding, weight=WEIGHT)
 
 
 @dataclass(frozen=True, kw_only=True)

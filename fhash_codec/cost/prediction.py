@@ -15,7 +15,7 @@ from typing import Annotated, TypedDict
 import numpy as np
 
 from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
-from fhash_codec.compact.goal import EXCHANGE, allows_trellis
+from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.head import (
     EFFORTS,
     GAIN_OF_HEAD,
@@ -35,6 +35,7 @@ from fhash_codec.compact.stages import (
     MIN_HEAD_EFFORT,
     SAMPLE_VERTICES,
     TRIAL_VERTICES,
+    allows_trellis,
     is_tried_in_parts,
     vertices_of_trials,
 )

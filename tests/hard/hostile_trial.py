@@ -48,7 +48,7 @@ LARGE = 1 << 22
 """Most vertices of a series that is decoded as a whole; of larger ones, a region is decoded."""
 OWN_WARNING = "fhash: warning: "
 EMPTY_PICTURE = "of the picture's pixels differ from the background"
-"""What `fhash render` says of a picture with hardly anything in it."""
+"""Part of the remark of `fhash render` on a picture with hardly anything in it."""
 
 
 class Trial:

@@ -374,7 +374,7 @@ class Planner {
     // Chooses the blocks of the most bytes, on which all trials are priced first.
     bool order(Set& set, const Kinds& kinds) {
         set.few = set.all;
-        if (!task_.halves || set.all.size() < 4) return true;
+        if (set.all.size() < 4) return true;
         std::vector<std::pair<double, size_t>> costs;
         for (const size_t number : set.all) {
             Price one;

@@ -31,8 +31,6 @@ typedef struct fhash_plan_task {
     double mean_square;     /* promised mean squared error; 0 for none */
     double error;           /* promised bound; 0 for none */
     double bytes;           /* promised bytes of all tiles; 0 for none */
-    int32_t halves;         /* 1: all candidates are priced on a quarter of the parts first */
-    int32_t reserved;
 } fhash_plan_task;
 
 typedef struct fhash_plan_result {

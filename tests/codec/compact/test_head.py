@@ -352,7 +352,7 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
     # Every stage of the last encoding reported, the trials and the training too.
     for part in ("first guess", "tiles and transform", "quantiser step", "head"):
         assert ("planning", part) in calls
-    assert calls.count(("training", "")) > 5
+    assert ("training", "") in calls
     stages = [stage for stage, _ in dict.fromkeys(calls)]
     assert list(dict.fromkeys(stages)) == [
         "scanning", "selecting", "planning", "training", "coding", "measuring", "writing",

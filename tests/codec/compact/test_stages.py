@@ -38,8 +38,6 @@ from fhash_codec.compact.goal import (
     goal_of,
     held_psnr,
     missed_promise,
-    off_trellis,
-    on_trellis,
     promise,
     remarks,
     search,
@@ -55,7 +53,7 @@ from fhash_codec.compact.stages import (
     first_guess,
     first_settings,
 )
-from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome, Tile
+from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome, Tile, off_trellis, on_trellis
 from fhash_codec.compact.transform import Bases, basis_bytes, usual_transform
 from fhash_codec.features.features import dilate, parse_feature
 from fhash_codec.features.selection import select_features
