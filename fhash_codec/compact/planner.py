@@ -19,7 +19,6 @@ import numpy.typing as npt
 from fhash_codec.compact.attempt import (
     DECODING_NS,
     FAST_BYTES,
-    MARGIN,
     MAX_WHOLE_VERTICES,
     PRICES,
     REGION_MS,
@@ -42,11 +41,9 @@ from fhash_codec.compact.stages import (
     MAX_SEARCHED_VERTICES,
     SAMPLE_VERTICES,
     allows_trellis,
-    choose_predicted,
     mean_center,
     plateau_center,
     try_head,
-    try_predictor,
     without_head,
 )
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome, on_trellis
@@ -88,6 +85,8 @@ FARTHEST = 3.0
 """Factor by which the step changes at most from one look to the next."""
 NEAR = 0.35
 """Change of the logarithm of the step, 2 dB, up to which no further look is needed."""
+DOUBT = 0.075
+"""Part of the allowed bytes of a tiling that no price may take: prices erred by as much."""
 AIM = 0.02
 """dB above the promise that the step is for: all tiles are coded again where they fall short."""
 LINES = 2048
@@ -155,13 +154,14 @@ def is_nearly_exact(task: PlanTask) -> bool:
 def is_priced(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool:
     """Whether a series is planned by prices.
 
-    They know neither features nor a size yet, nor do they find the fewest bytes at any cost.
+    They know neither features nor a size yet, take more bytes under some bounds, and do not find
+    the fewest bytes at any cost.
     """
     goal = task.goal
     return (
         1 < task.config.effort <= MAX_PRICED_EFFORT
         and task.config.access != "small"
-        and (goal.psnr is not None or (goal.error is not None and not goal.lossless))
+        and goal.psnr is not None
         and goal.data_range > 0
         and tiled.in_memory
         and tiled.complete
@@ -203,8 +203,6 @@ class _Task(ctypes.Structure):
         ("most", ctypes.c_double),
         ("step", ctypes.c_double),
         ("mean_square", ctypes.c_double),
-        ("error", ctypes.c_double),
-        ("bytes", ctypes.c_double),
     )
 
 
@@ -324,10 +322,9 @@ def priced_plan(
         region_ns=1e6 * REGION_MS[config.access],
         vertex_ns=TRANSFORM_NS + first,
         bit_ns=more,
-        most=max(PRICES[config.access] - MARGIN, 1.0),
+        most=max(PRICES[config.access] - DOUBT, 1.0),
         step=settings.step,
-        mean_square=0.0 if goal.psnr is None else goal.expected_error**2,
-        error=goal.error or 0.0,
+        mean_square=goal.expected_error**2,
     )
     if sheets is not None:
         given.sheets = held.parts(sheets, settings.center)
@@ -384,8 +381,7 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
         tell("plan", f"--access {config.access}: {tiling.describe()}")
     tiled = blocks.retile(found.tile)
     sample = Sample(tiled, 1, task.workers)
-    rounding = float(np.finfo(blocks.dtype).eps) / 2 if blocks.dtype.kind == "f" else 0.0
-    settings = with_step(settings, found.step, goal, rounding)
+    settings = with_step(settings, found.step, goal)
     with stage("bases", "the data's own bases, of all lines of the series"):
         settings = replace(settings, transform=found.transform(Bases(sample, settings)))
     coding = Coding(
@@ -410,12 +406,7 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
         tiling=tiling,
         quick=True,
     )
-    if goal.psnr is not None:
-        return with_head(task, attempt, parts, moved)
-    # What a predictor competes with is no estimate.
-    attempt = try_predictor(task, on_all_tiles(task, attempt))
-    attempt = with_head(task, attempt, parts, moved)
-    return choose_predicted(task, attempt)
+    return with_head(task, attempt, parts, moved)
 
 
 ROWS = 4
@@ -488,17 +479,16 @@ def _coded(
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
     moved = moved_transform(parts, settings)
-    outcome = parts.run(moved, goal.bounded(coding))
+    outcome = parts.run(moved, coding)
     if task.is_slow(tiled.tile, size):
         faster = replace(coding, fast=True)
-        other = parts.run(moved, goal.bounded(faster))
+        other = parts.run(moved, faster)
         ratio = _at_promise(other, goal) / max(_at_promise(outcome, goal), 1.0)
         most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
         tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
         if ratio <= most:
             coding, outcome = faster, other
-    if goal.psnr is None:
-        return settings, coding, outcome, moved
+    assert goal.psnr is not None
     for _ in range(LOOKS):
         step = _step(task, settings, moved, tiled, parts, outcome)
         change = min(max(step / settings.step, 1 / FARTHEST), FARTHEST)
@@ -507,7 +497,7 @@ def _coded(
         # So far from where it was measured, coefficients foretell the error badly.
         settings = with_step(settings, change * settings.step, goal)
         moved = moved_transform(parts, replace(moved, step=settings.step, double=settings.double))
-        outcome = parts.run(moved, goal.bounded(coding))
+        outcome = parts.run(moved, coding)
     else:
         step = _step(task, settings, moved, tiled, parts, outcome)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
@@ -523,8 +513,7 @@ def _coded(
 
 def _at_promise(outcome: Outcome, goal: Goal) -> float:
     """Return the bytes at a promised PSNR, by the usual exchange rate of dB for bytes."""
-    if goal.psnr is None:
-        return outcome.size
+    assert goal.psnr is not None
     missing = goal.psnr - outcome.psnr(goal.data_range)
     return float(outcome.size * 2 ** (missing / EXCHANGE))
 
@@ -610,5 +599,5 @@ def on_all_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     blocks = attempt.sample.blocks
     costs = part_costs(task, blocks, attempt.settings.step)
     sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
-    outcome = sample.run(attempt.settings, task.goal.bounded(attempt.coding))
+    outcome = sample.run(attempt.settings, attempt.coding)
     return replace(attempt, sample=sample, outcome=outcome, tried=[outcome])

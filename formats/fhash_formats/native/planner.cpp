@@ -22,6 +22,7 @@ constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a pack
 constexpr double NEAR = 1.02;         // of the cheapest on few parts: then all parts are priced
 constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
 constexpr double OCTAVES = 0.67;      // of bytes for an octave of squared errors: 4.5 dB an octave
+constexpr double MIN_SLOPE = 2, MAX_SLOPE = 12, MIN_APART = 0.01;  // that are believed
 constexpr double SLOPE = 5.5;         // dB by which the PSNR falls for a step larger by e
 constexpr double LEAST_EXTRA = 0.002;  // share of extra bytes that a block corrects
 constexpr double LEAST_TOLD = 0.5;    // bytes of cuts along an axis, as a multiple
@@ -75,19 +76,6 @@ Kinds usual(const int64_t* shape) {
     return {line, line, plane, plane};
 }
 
-// Bytes of each of normal errors that are rounded to a quantum. sigma: their deviation in quanta.
-double rounded_bytes(double sigma) {
-    if (sigma > 8) return std::log2(sigma * 4.132731354122493) / 8;  // sqrt(2 pi e)
-    const int reach = (int)std::ceil(8 * sigma);
-    const double unit = std::sqrt(2.0) * std::max(sigma, 1e-9);
-    double bits = 0;
-    for (int i = -reach; i <= reach; i++) {
-        const double chance = (std::erf((i + 0.5) / unit) - std::erf((i - 0.5) / unit)) / 2;
-        if (chance > 0) bits -= chance * std::log2(chance);
-    }
-    return bits / 8;
-}
-
 // Blocks of one shape on which trials are priced, and those few of them that tell most.
 struct Set {
     Blocks blocks;
@@ -111,7 +99,9 @@ class Planner {
         if (!settle(columns, kinds, 2)) return false;
         if (!choose(columns, sheets, box_, 15, kinds) || !settle(columns, kinds, 1)) return false;
         Shape tile;
-        if (!choose_tile(columns, sheets, kinds, tile, result)) return false;
+        const Set block = read(task_.block);
+        if (!check_plane(block, kinds)) return false;
+        if (!choose_tile(columns, sheets, block, kinds, tile, result)) return false;
         if (tile != box_) {
             const Set* const sets[2] = {&columns, &sheets};
             Set cuts[2];
@@ -349,10 +339,7 @@ class Planner {
             const Block& block = blocks.all[which[job % which.size()]];
             Price& of = prices[job / which.size()];
             const double squares = results[2 * job + 1] * step_ * step_;
-            double bytes = results[2 * job];
-            if (task_.error > 0)
-                bytes += n * rounded_bytes(std::sqrt(squares / n) / (2 * task_.error));
-            of.bytes += block.weight * bytes;
+            of.bytes += block.weight * results[2 * job];
             of.squares += block.weight * block.share * squares;
             of.count += block.weight * block.share * n;
         }
@@ -360,14 +347,13 @@ class Planner {
     }
 
     double cost(const Price& price) const {
-        return price.bytes +
-               (task_.error > 0 ? 0 : price.squares / (ERROR_PRICE * step_ * step_));
+        return price.bytes + price.squares / (ERROR_PRICE * step_ * step_);
     }
 
     // Bytes at equal quality as a multiple of those of another price of the same values.
     double relative(const Price& one, const Price& other) const {
         const double bytes = one.bytes / std::max(other.bytes, 1.0);
-        if (task_.error > 0 || one.squares <= 0 || other.squares <= 0) return bytes;
+        if (one.squares <= 0 || other.squares <= 0) return bytes;
         return bytes * std::pow(one.squares / other.squares, OCTAVES);
     }
 
@@ -448,6 +434,18 @@ class Planner {
         return improve(columns, tile, changes, kinds);
     }
 
+    // Thin sheets may not tell what own bases are worth in a plane whose steps have
+    // much in common: a block does. Where they tell it, they know better: a block may be shorter.
+    bool check_plane(const Set& block, Kinds& kinds) {
+        const auto may = [&](size_t a) {
+            return own(a, block.shape()[a]).basis && own(a, box_[a]).basis;
+        };
+        if (block.all.empty() || kinds[2].kind == KLT_KIND || !may(2) || !may(3)) return true;
+        Kinds other = kinds;
+        other[2] = other[3] = {KLT_KIND, 0};
+        return improve(block, box_, {other}, kinds);
+    }
+
     bool choose_along(const Set& set, const Shape& tile, size_t axis,
                       const std::vector<Kind>& options, Kinds& kinds) {
         std::vector<Kinds> changes;
@@ -475,59 +473,20 @@ class Planner {
 
     // Looks for the step that keeps the promise.
     bool settle(const Set& set, const Kinds& kinds, int tries) {
-        if (task_.error > 0) return settle_bound(set, kinds);
         double slope = SLOPE, before_log = 0, before = 0;
         for (int i = 0; i < tries; i++) {
             Price found;
             if (!price(set, set.all, set.shape(), {kinds}, &found)) return false;
-            double change;  // of the logarithm of the step
-            if (task_.bytes > 0) {
-                change = std::log(std::max(found.bytes, 1.0) / task_.bytes) * 0.8;
-            } else if (task_.mean_square > 0 && found.mean_square() > 0) {
-                const double missing = 10 * std::log10(found.mean_square() / task_.mean_square);
-                const double at = std::log(step_);
-                if (i > 0 && std::fabs(at - before_log) > 0.01)
-                    slope = std::min(std::max((missing - before) / (at - before_log), 2.0), 12.0);
-                before = missing;
-                before_log = at;
-                change = -missing / slope;
-            } else {
-                return true;
-            }
-            step_ *= std::exp(std::min(std::max(change, -2.0), 2.0));
+            if (found.mean_square() <= 0) return true;
+            const double missing = 10 * std::log10(found.mean_square() / task_.mean_square);
+            const double at = std::log(step_);
+            if (i > 0 && std::fabs(at - before_log) > MIN_APART)
+                slope = std::min(std::max((missing - before) / (at - before_log), MIN_SLOPE),
+                                 MAX_SLOPE);
+            before = missing;
+            before_log = at;
+            step_ *= std::exp(std::min(std::max(-missing / slope, -2.0), 2.0));
         }
-        return true;
-    }
-
-    // The step that costs least under a bound, of some in thirds of an octave.
-    bool settle_bound(const Set& set, const Kinds& kinds) {
-        std::map<int, double> costs;
-        const auto cost_at = [&](int number, double& found) {
-            const auto known = costs.find(number);
-            if (known != costs.end()) return found = known->second, true;
-            step_ = task_.error * std::exp2(number / 3.0);
-            Price at;
-            if (!price(set, set.few, set.shape(), {kinds}, &at)) return false;
-            return found = costs[number] = cost(at), true;
-        };
-        constexpr int LAST = 15;
-        int best = (int)std::lround(3 * std::log2(std::max(step_ / task_.error, 1.0)));
-        best = std::min(best, LAST);
-        for (bool moved = true; moved;) {
-            moved = false;
-            double least, other;
-            if (!cost_at(best, least)) return false;
-            for (const int next : {best + 1, best - 1}) {
-                if (next < 0 || next > LAST) continue;
-                if (!cost_at(next, other)) return false;
-                if (other < least) {
-                    best = next;
-                    moved = true;
-                    break;
-                }
-            }
-        }
-        step_ = task_.error * std::exp2(best / 3.0);
         return true;
     }
 
@@ -645,14 +604,13 @@ class Planner {
 
     // The tile of the least burden by what cuts cost. Thin parts tell too little of that, since
     // other axes are cut already: what they foretell of a tile is checked on a large block.
-    bool choose_tile(const Set& columns, const Set& sheets, const Kinds& kinds, Shape& tile,
-                     fhash_plan_result& result) {
+    bool choose_tile(const Set& columns, const Set& sheets, const Set& block, const Kinds& kinds,
+                     Shape& tile, fhash_plan_result& result) {
         result.price = 1;
         if (task_.tile_count == 1) return std::copy_n(task_.tiles, 4, tile.begin()), true;
         Cuts cuts;
         double bytes;
         if (!price_cuts(columns, sheets, kinds, cuts, bytes)) return false;
-        const Set block = read(task_.block);
         Price whole;
         std::map<Shape, double> checked = {{block.shape(), 1.0}};
         for (bool only = false;; only = checked.size() > MOST_CHECKS) {

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from planned import plan_task, waves
 from rarely import rarely
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec.compact import attempt as access
+from fhash_codec.compact import encode
 from fhash_codec.compact.encode import (
     SIZE_PASSES,
     ByteWindow,
@@ -32,12 +34,15 @@ from fhash_codec.compact.encode import (
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.head_training import Budget, Pair, Shape, train_head
 from fhash_codec.compact.plan import CodingPlan
+from fhash_codec.compact.planner import block_of, column_of, plan_by_prices, sheet_of
+from fhash_codec.compact.stages import first_settings
 from fhash_codec.compact.tiles import Coding, Outcome, recoded
 from fhash_codec.compact.transform import usual_transform
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import ArraySeries
+from fhash_formats.support.threads import at_most
 from fhash_formats.transform.head import NeighbourHead
 from fhash_formats.transform.tile_format import TileSettings
 
@@ -472,3 +477,67 @@ def test_a_header_says_what_the_tiles_cost(
         assert all(1 <= n <= m for n, m in zip(record["best"], shape, strict=True))
     if "region_ms" in record:
         assert record["region_ms"] > 0
+
+
+Lengths = tuple[int, int, int, int]
+SHAPES = [(12, 25, 125, 125), (600, 1, 24, 24), (1, 300, 300, 300), (2000, 4, 5, 6), (3, 3, 3, 3)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("part_of", [column_of, sheet_of, block_of])
+def test_parts_lie_in_their_series(
+    part_of: Callable[[Lengths, int], Lengths], shape: Lengths
+) -> None:
+    part = part_of(shape, 1 << 16)
+    assert all(1 <= n <= length for n, length in zip(part, shape, strict=True))
+    assert math.prod(part) <= 2 << 16
+    assert part == shape or math.prod(part) > 1 << 12
+
+
+def moving(kind: str) -> Series:
+    """Return 20 x 8 x 48 x 48 values: 'separable' of one mode, or a 'front' that moves."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (20, 8, 48, 48)), indexing="ij")
+    if kind == "front":
+        return np.where(x + 0.3 * np.sin(9 * y) + 0.2 * z < 0.2 + t, 1, 0).astype(np.float32)
+    rough = np.random.default_rng(0).normal(size=(4, 48))
+    pairs = zip((t, z, y, x), rough, strict=True)
+    modes = [np.interp(axis, np.linspace(0, 1, 48), row) for axis, row in pairs]
+    noise = np.random.default_rng(1).normal(size=t.shape)
+    return (math.prod(modes) + 1e-3 * noise).astype(np.float32)
+
+
+def planned(values: Series, workers: ThreadPoolExecutor) -> access.Attempt:
+    task = plan_task(values, workers)
+    return plan_by_prices(task, first_settings(task, task.blocks.retile((20, 8, 24, 24))))
+
+
+def test_prices_find_the_transform_of_each_kind() -> None:
+    """A single mode needs one own vector along a long axis; a front needs haar in the plane."""
+    with ThreadPoolExecutor(2) as workers:
+        separable = planned(moving("separable"), workers).settings.transform
+        front = planned(moving("front"), workers).settings.transform
+    assert [separable.axes[axis].kind for axis in (0, 2, 3)] == ["klt"] * 3
+    assert [axis.kind for axis in front.axes[2:]] == ["haar"] * 2
+
+
+@pytest.mark.parametrize("kind", ["separable", "front"])
+def test_a_plan_does_not_depend_on_the_threads(kind: str) -> None:
+    plans = []
+    for threads in (1, 2, 8):
+        with at_most(threads), ThreadPoolExecutor(threads) as workers:
+            plans.append(planned(moving(kind), workers).settings)
+    assert plans[0] == plans[1] == plans[2]
+
+
+@pytest.mark.parametrize("psnr", [40.0, 60.0])
+def test_one_or_two_codings_come_near_the_promise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, psnr: float
+) -> None:
+    coded = []
+    code_all = encode._code_all
+    monkeypatch.setattr(encode, "_code_all", lambda *a, **k: coded.append(1) or code_all(*a, **k))
+    values = waves((12, 12, 60, 60))
+    figures = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=psnr))
+    assert len(coded) <= 2
+    assert psnr <= psnr_of(values, decoded(tmp_path / "a.fhz")) < psnr + 0.15
+    assert figures["psnr"] == pytest.approx(psnr_of(values, decoded(tmp_path / "a.fhz")), 1e-6)
