@@ -481,7 +481,8 @@ class Volume(Card, ArrayLike):
         values = self._in_range(values.reshape(shape).astype(self.float_dtype))
         if slopes is None:
             return values
-        return values, slopes.reshape(*shape, 4).astype(self.float_dtype)
+        with np.errstate(over="ignore"):  # a derivative may be too large for its type
+            return values, slopes.reshape(*shape, 4).astype(self.float_dtype)
 
     def occupancy(self, t: float, region: Spans | None = None) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of a region that are in the coreset at step `t`.

@@ -587,9 +587,9 @@ def _times(series: Series, growing: GrowingFile) -> npt.NDArray[np.float64]:
     if "t" not in series.given:
         return _times_after(what, before, series.shape[0])
     times = _counted_as_in(growing.path, before, what, series.coords["t"])
-    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+    if not np.isfinite(times).all() or not (times[1:] > times[:-1]).all():
         raise InputError(f"{what}: its times must be finite and ascend")
-    if not (np.diff(before.values) > 0).all():
+    if not (before.values[1:] > before.values[:-1]).all():
         raise InputError(f"{growing.path}: its times do not ascend; begin another file")
     if not times[0] > before.values[-1]:
         raise InputError(

@@ -66,7 +66,13 @@ class PlainCoder:
         """The bytes of a full chunk, and their CRC-32C."""
         from numcodecs.zstd import compress
 
-        return with_crc32c(compress(np.ascontiguousarray(chunk, dtype=self._stored), self._level))
+        try:
+            packed = compress(np.ascontiguousarray(chunk, dtype=self._stored), self._level)
+        except RuntimeError as error:
+            if "not enough memory" in str(error):
+                raise MemoryError(str(error)) from error
+            raise
+        return with_crc32c(packed)
 
     def check(self, data: memoryview) -> None:
         """Raises DamagedFileError where the CRC-32C differs."""

@@ -191,10 +191,11 @@ def same_positions(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64])
     """Whether positions are the same, but for their rounding to float32."""
     if one.shape != other.shape:
         return False
-    allowed = ROUNDING * np.maximum(np.abs(one), np.abs(other))
-    if other.size > 1:
-        allowed = np.minimum(allowed, SHARE_OF_STEP * np.abs(np.diff(other)).min())
-    return bool(np.array_equal(one, other) or (np.abs(one - other) <= allowed).all())
+    with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file
+        allowed = ROUNDING * np.maximum(np.abs(one), np.abs(other))
+        if other.size > 1:
+            allowed = np.minimum(allowed, SHARE_OF_STEP * np.abs(np.diff(other)).min())
+        return bool(np.array_equal(one, other) or (np.abs(one - other) <= allowed).all())
 
 
 def require_same_grid(
@@ -245,7 +246,8 @@ def same_places(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> bool:
     if one.shape != other.shape:
         return False
     a, b = one.astype(np.float64), other.astype(np.float64)
-    return bool(np.allclose(a, b, rtol=2 * ROUNDING, atol=0, equal_nan=True))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.allclose(a, b, rtol=2 * ROUNDING, atol=0, equal_nan=True))
 
 
 def _same_value(one: Any, other: Any) -> bool:
