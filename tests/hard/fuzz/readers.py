@@ -118,13 +118,18 @@ def _float(chance: random.Random, data: bytearray) -> bytes:
     return bytes(data)
 
 
+MOST_REPEATED = 1 << 24
+"""Bytes that a repeated part takes at most."""
+
+
 def _repeated(chance: random.Random, data: bytearray) -> bytes:
     """A line, or a word of it, stands many times."""
     lines = bytes(data).splitlines(keepends=True)
     place = chance.randrange(min(len(lines), 60))
     part = lines[place] if chance.random() < 0.5 else chance.choice(lines[place].split() or [b" "])
     part = part if part.endswith(b"\n") else part + b" "
-    lines[place] += part * chance.choice((1, 3, 50, 3000))
+    # A binary file may be one long line.
+    lines[place] += part * min(chance.choice((1, 3, 50, 3000)), MOST_REPEATED // len(part))
     return b"".join(lines)
 
 
