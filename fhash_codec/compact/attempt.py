@@ -11,15 +11,15 @@ from itertools import product
 from math import prod
 from typing import Any
 
-from fhash_codec.compact.goal import Goal, Slope
+from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.progress import Parts
+from fhash_codec.progress import Parts, skip
+from fhash_formats.container.reader import CACHE_BYTES
 from fhash_formats.errors import InputError
-from fhash_formats.transform.spec import AxisTransform
 from fhash_formats.transform.stream import MAX_TILE_VERTICES
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
@@ -141,14 +141,6 @@ MAX_WHOLE_VERTICES = 12 << 20
 
 PRICES = {"fast": 1.5, "balanced": 1.1, "small": 1.0}
 """Bytes that tiles may take, as a multiple of those of the best tiling, by the wish for access."""
-MARGIN = 0.06
-"""Part of an allowed price that no trial may take.
-
-Prices of whole files were up to 0.09 above those of the trials (turbulence within 1 %), and 0.05 in
-most of the worst cases.
-"""
-MARGIN_FORETOLD = 0.035
-"""Part of an allowed price that no foretold one may take, which is too high rather than too low."""
 WORTH = {"fast": 1.0, "balanced": 0.01, "small": 0.0}
 """Share of the bytes that half the work for a region is worth, by the wish for access."""
 REGION_MS = {"fast": 3.0, "balanced": 30.0, "small": math.inf}
@@ -181,16 +173,7 @@ EDGES = (256, 192, 128, 96, 64, 48, 32, 24, 16)
 """Edges in space in vertices that tiles are tried at, approximately."""
 SHORTEST = 8
 """Vertices of a tile along the longest axis in space, at least, where it alone is cut."""
-CUT_IN_SPACE = 6.0
-"""Share of the bytes that a cut across space costs, times the vertices between such cuts.
-
-The most that was found on series of many kinds where nothing is tried (effort 1).
-"""
-CUT_IN_TIME = 10.0
-"""The same of a cut in time, by steps."""
-CUT_BETWEEN = 0.2
-"""The same between two wavelets."""
-BYTES_OF_TILE = 100
+TILE_BYTES = 100
 """Bytes that each further tile costs: its place in the file, and the beginning of its coder."""
 
 
@@ -202,33 +185,13 @@ class Tiling:
     price: float | None
     """Bytes as a multiple of those of the best tiling; foretold where none was tried, and None for
     tiles that were asked for."""
-    trials: dict[Shape, float] = field(default_factory=dict)
-    """Bytes of the tilings that were tried, at the quality of the first."""
-    parts: list[Shape] = field(default_factory=list)
-    """Shapes of the parts that the tilings were tried on; none for the whole series."""
     tried: int = 0
-    """Number of tilings that were priced, where none was coded."""
-    found: tuple[TileSettings, Outcome] | None = None
-    """Settings of these tiles, with a good transform and step, and what was foretold of them; None
-    where the whole series was not tried with them."""
-
-    @property
-    def best(self) -> Shape | None:
-        """Tile of the fewest bytes of those tried."""
-        return min(self.trials, key=self.trials.__getitem__) if self.trials else None
+    """Number of tilings that were priced; 0 where the price is foretold."""
 
     def describe(self) -> str:
-        """Return the tilings that were tried, with their prices, as one line."""
-        if not self.trials:
-            priced = f"priced {self.tried} tilings" if self.tried else "foretold"
-            return f"{priced}: {self.price:.2f} times the bytes of the best one"
-        least = min(self.trials.values())
-        told = ", ".join(
-            f"{' x '.join(map(str, tile))} at {size / least:.2f}"
-            for tile, size in self.trials.items()
-        )
-        parts = " and ".join(" x ".join(map(str, part)) for part in self.parts)
-        return f"tried {told}{f', on parts of {parts} vertices' if parts else ''}"
+        """Return how the tiling was chosen, and its price, as one line."""
+        priced = f"priced {self.tried} tilings" if self.tried else "foretold"
+        return f"{priced}: {self.price:.2f} times the bytes of the best one"
 
 
 def region_vertices(shape: Shape, tile: Shape) -> float:
@@ -343,45 +306,26 @@ def is_small(shape: Shape) -> bool:
     return prod(shape) <= 2 * FAST_ENOUGH
 
 
-def foretold_price(
-    shape: Shape, tile: Shape, size: float, time: AxisTransform | None = None
-) -> float:
-    """Return the price of tiles that nothing was tried for: the most that is likely.
+def largest_tile(shape: Shape) -> Shape:
+    """Return the tile of the most space and then the most steps, some at least, that may be tried.
 
-    size, time: see `cheap_tiling`.
+    It is that of a series that is too large for a single one.
     """
-    cuts = 1 / tile[0] - 1 / shape[0]
-    # Haar reaches across no multiple of its longest wavelet.
-    alone = time is not None and time.kind == "haar" and tile[0] % (1 << time.depth) == 0
-    cuts *= CUT_BETWEEN if alone else CUT_IN_TIME
-    cuts += CUT_IN_SPACE * sum(
-        1 / n - 1 / length for length, n in zip(shape[1:], tile[1:], strict=True) if n < length
-    )
-    count = prod(-(-length // n) for length, n in zip(shape, tile, strict=True))
-    return 1 + cuts + BYTES_OF_TILE * (count - 1) / max(size, 1.0)
+    tiles = tiles_to_try(shape, MAX_VERTICES)
+    some = [tile for tile in tiles if tile[0] >= min(FIRST_STEPS, shape[0])]
+    return max(some or tiles, key=lambda tile: (prod(tile[1:]), tile[0]))
 
 
-def cheap_tiling(
-    shape: Shape, size: float, access: str, time: AxisTransform | None = None
-) -> Tiling:
-    """Return the tiles of the fastest region whose foretold price is allowed.
+def tiles_of_large(blocks: Blocks) -> list[Shape]:
+    """Return the tiles that may be tried for a series that is too large for a single one.
 
-    Foretold prices are too rough to say which tiles are best.
-
-    size: bytes of the series as one tile, roughly.
-    access: the wish, a name of `PRICES`.
-    time: transform along time, where it is known.
+    A reader that goes from step to step keeps the tiles of a layer as far as its cache reaches; of
+    longer ones it would decode all for each step.
     """
-    may_be_one = prod(shape) <= MAX_WHOLE_VERTICES
-    tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES if may_be_one else MAX_VERTICES)
-    prices = [foretold_price(shape, tile, size, time) for tile in tiles]
-    # The best tiling of a long series is no single tile.
-    lowest = min(prices)
-    allowed = max(PRICES[access] - MARGIN_FORETOLD, 1.0)
-    for tile, told in zip(tiles, prices, strict=True):
-        if told <= allowed * lowest:
-            return Tiling(tile=tile, price=told / lowest)
-    raise AssertionError("the lowest price is allowed")
+    frame = prod(blocks.shape[1:]) * blocks.dtype.itemsize
+    steps = max(CACHE_BYTES // frame, largest_tile(blocks.shape)[0])
+    tiles = tiles_to_try(blocks.shape, MAX_VERTICES, slabs=True)
+    return [tile for tile in tiles if tile[0] <= steps]
 
 
 class GainLog:
@@ -423,8 +367,13 @@ class PlanTask:
     gains: GainLog
     parts: Parts = field(default_factory=Parts)
     """Progress of the planning."""
-    slope: Slope = field(default_factory=Slope)
-    """Fall of the PSNR with the step."""
+
+    def asks(self, name: str) -> bool:
+        """Whether the settings leave a stage in; one that they leave out is recorded."""
+        if name not in self.config.without:
+            return True
+        skip(name, f"--without {name}")
+        return False
 
     @property
     def density(self) -> int:
@@ -464,15 +413,12 @@ class Attempt:
     coding: Coding
     """Options of the encoder, without the bound."""
     tried: list[Outcome] = field(default_factory=list)
-    """Outcomes on the way of the search for the PSNR, without a head."""
+    """Outcome of all tiles, or of many, without a head; empty where none were coded."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head."""
-    predicted: tuple[TileSettings, int] | None = None
-    """Settings with a predictor, and the bytes of all tiles by it; None where none was trained."""
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
-    quick: bool = False
-    """Whether trials are few, and priced or coded by the fast coder."""
-    sharp: bool = False
-    """Whether trials are some more, since many values are alike: beside a plateau are often shocks,
-    for which other transforms are good, and of which one part tells little of others."""
+    parts: Sample | None = None
+    """Parts of the tiles that were coded."""
+    moved: TileSettings | None = None
+    """Settings of these parts."""

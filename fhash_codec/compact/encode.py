@@ -34,7 +34,6 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import HEAD_BYTES
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
-from fhash_codec.compact.sample import MAX_PRICED_EFFORT
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
@@ -139,8 +138,7 @@ def tiling_header(table: CodedTable, *, timings: bool, quick: bool) -> dict[str,
     if tiling is not None and tiling.price is not None:
         record = {
             "price": round(tiling.price, 3),
-            "best": list(tiling.best or table.plan.blocks.shape),
-            "tried": len(tiling.trials) or tiling.tried,
+            "tried": tiling.tried,
         }
     if table.plan.coding.fast:
         record["coder"] = "fast"
@@ -236,8 +234,6 @@ EXCESS = 0.05
 USUAL_EXCESS = 0.12
 """The same by default. Only series of which a sample was searched miss it, the large ones: a pass
 over 1.5 GB took 10 of 33 seconds for 0.9 % of the bytes."""
-QUICK_AIM = 0.12
-"""dB added to the PSNR at effort 1, where one pass should do: the precision of the estimate."""
 QUICK_EXCESS = 0.35
 """Excess in dB that is worth another pass at effort 1."""
 MARGIN = 0.005
@@ -283,7 +279,7 @@ def code_series(
                 table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
         else:
             excess = EXCESS
-            if config.effort <= MAX_PRICED_EFFORT and config.access != "small":
+            if config.access != "small":
                 excess = QUICK_EXCESS if config.effort == 1 else USUAL_EXCESS
             aim = _Aim(psnr=goal.psnr, data_range=goal.data_range, excess=excess)
             table = _code_to_psnr(coding_plan, aim, workers, progress)
@@ -372,11 +368,6 @@ class _Aim:
     """Excess in dB that is worth another pass."""
 
     @property
-    def quick(self) -> bool:
-        """Whether one pass should do."""
-        return self.excess >= QUICK_EXCESS
-
-    @property
     def min_psnr(self) -> float:
         """PSNR in dB that must be reached."""
         return self.psnr + SAFE
@@ -386,15 +377,13 @@ class _Aim:
         return outcome.psnr(self.data_range)
 
     def is_met(self, psnr: float, attempt: int) -> bool:
-        """Whether a PSNR keeps the promise, and in the first attempt does not exceed it by much."""
+        """Whether a PSNR keeps the promise, and in two attempts does not exceed it by much."""
         if psnr < self.min_psnr:
             return False
-        return attempt > 0 or psnr < self.psnr + self.excess or math.isinf(psnr)
+        return attempt > 1 or psnr < self.psnr + self.excess or math.isinf(psnr)
 
     def next_target(self, psnr: float, attempt: int) -> float:
         """Return the PSNR to search for after an attempt that reached `psnr`."""
-        if self.quick:
-            return self.min_psnr + (EXCESS + abs(psnr - self.psnr) / 8)
         return self.min_psnr + MARGIN * float(2**attempt)
 
     def prefers(self, outcome: Outcome, other: Outcome) -> bool:
@@ -413,9 +402,6 @@ def _code_to_psnr(
     Where they turn out much worse than the sample, what was learned from it is dropped, one after
     the other: the head, then the data's own bases.
     """
-    if aim.quick:
-        step = coding_plan.settings.step * (1 - QUICK_AIM / SLOPE)
-        coding_plan = replace(coding_plan, settings=replace(coding_plan.settings, step=step))
     best: CodedTable | None = None
     for simpler_plan in _simpler_plans(coding_plan):
         best = _search_psnr(simpler_plan, aim, best, workers, progress)

@@ -42,54 +42,27 @@ EXCHANGE = 4.5
 """dB that an octave of bytes buys, where no search says it better."""
 USUAL_FALL = SLOPE / EXCHANGE
 """Octaves of bytes that a step larger by a factor of e saves: the first assumption."""
-MIN_LOSS = 0.02
-"""Smallest difference in dB of two outcomes from which their exchange rate is taken."""
-
-
-APART = 0.01
-"""The same where the slope is kept for other tiles and transforms."""
-
-
-@dataclass
-class Slope:
-    """Fall of the PSNR of a series with the step, as the last trials have found it.
-
-    Attributes:
-        slope: dB per factor of e.
-        apart: difference of log steps from which on two trials tell it.
-    """
-
-    slope: float = SLOPE
-    apart: float = APART
-    _before: tuple[float, float] | None = None
-
-    def restart(self) -> None:
-        """Forget the last trial: the next one has another transform or other tiles."""
-        self._before = None
-
-    def note(self, step: float, psnr: float) -> None:
-        """Take up a trial, the PSNR in dB of a step."""
-        log_step = math.log(step)
-        if self._before is not None and abs(self._before[0] - log_step) > self.apart:
-            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
-            if math.isfinite(fall):
-                self.slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
-        self._before = log_step, psnr
 
 
 class PsnrSearch:
     """Search for the quantiser step at which a PSNR is reached, by secants of the log step."""
 
-    def __init__(self, min_step: float, max_step: float, slope: float = SLOPE) -> None:
-        """Begin a search between two steps. slope: dB per factor of e that is assumed at first."""
+    def __init__(self, min_step: float, max_step: float) -> None:
+        """Begin a search between two steps."""
         self._ends = min_step, max_step
-        self._slope = Slope(slope, MIN_APART)
+        self._slope = SLOPE
+        self._before: tuple[float, float] | None = None
 
     def after(self, step: float, psnr: float, target: float) -> float:
         """Take up a trial, the PSNR in dB of a step; return the step that should reach `target`."""
-        self._slope.note(step, psnr)
+        log_step = math.log(step)
+        if self._before is not None and abs(self._before[0] - log_step) > MIN_APART:
+            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
+            if math.isfinite(fall):
+                self._slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
+        self._before = log_step, psnr
         low, high = map(math.log, self._ends)  # 0 where nothing but a first trial is made
-        wanted = math.log(step) + (psnr - target) / self._slope.slope
+        wanted = log_step + (psnr - target) / self._slope
         return math.exp(min(max(wanted, low), high))
 
 
@@ -208,19 +181,6 @@ class SizeSearch:
         self._before = log_step, size
         octaves = math.log2(max(size, 1) / self._target)
         return self._bracket.inside(log_step + octaves / self._fall)
-
-
-def exchange(points: Sequence[tuple[float, float]], usual: float) -> float:
-    """Return the dB that one more octave of bytes buys, by the last points some way apart.
-
-    points: pairs (log2 of the bytes, PSNR in dB) in the order of their trials.
-    usual: the result where no two successive points are apart.
-    """
-    for (size, psnr), (size_before, psnr_before) in zip(points[::-1], points[-2::-1], strict=False):
-        gain = psnr - psnr_before
-        if abs(gain) >= MIN_LOSS and gain * (size - size_before) > 0:
-            return gain / (size - size_before)
-    return usual
 
 
 def cheapest(
@@ -540,55 +500,26 @@ def _missed_ratio(config: EncodeConfig, figures: Mapping[str, Any]) -> str | Non
     return f"{figures['ratio']:.4g} times smaller than the data, {config.ratio:g} were asked for"
 
 
-def octave_gain(tried: Sequence[Outcome], data_range: float) -> float:
-    """Return the dB that an octave of bytes buys, by outcomes of one coding at several steps.
-
-    data_range: range of the values, in data units.
-    """
-    points = [
-        (math.log2(outcome.size), outcome.psnr(data_range)) for outcome in tried if outcome.size
-    ]
-    return exchange(points, EXCHANGE)
-
-
-def step_after(settings: TileSettings, outcome: Outcome, goal: Goal, slope: float = SLOPE) -> float:
+def step_after(settings: TileSettings, outcome: Outcome, goal: Goal) -> float:
     """Return the step at which a promised PSNR should be reached, by one outcome of the settings.
 
-    For other promises it is the step of the settings. slope: dB per factor of e.
+    For other promises it is the step of the settings.
     """
     psnr = outcome.psnr(goal.data_range)
     if goal.psnr is None or not math.isfinite(psnr):
         return settings.step
     gain = min(max(psnr - goal.psnr, -SLOPE), SLOPE)
-    return step_after_gain(settings.step, gain * SLOPE / slope)
+    return step_after_gain(settings.step, gain)
 
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
 
 
-@dataclass(frozen=True)
-class Precision:
-    """Distance in dB to which a search for the step comes near a promised PSNR.
-
-    Attributes:
-        aim: above the PSNR asked for: all tiles should not fall short again.
-        close: distance from that aim at which a search ends.
-        slope: what the search begins with, and what it finds; None for the usual one.
-    """
-
-    aim: float
-    close: float
-    slope: Slope | None = None
-
-
-EXACT = Precision(0.005, 0.004)
-"""Precision of the last search."""
-QUICK = Precision(0.013, 0.012)
-"""The same where seconds count more than the 0.1 % of the bytes that this may cost."""
-NEAR = Precision(0.005, 0.03)
-"""Precision before a head is tried: candidates are compared at equal quality, and the step is
-searched once more for the best."""
+STEP_AIM = 0.005
+"""dB above a promised PSNR that a search on a sample is for: all tiles should keep it, too."""
+CLOSE = 0.004
+"""Distance in dB from that aim at which such a search ends."""
 STEPS_TO_OCTAVE = 3
 """Steps per octave that are tried under a strict bound."""
 MAX_STEP_NUMBER = 15
@@ -640,10 +571,10 @@ def with_step(
     return replace(settings, step=step, double=double, quantum=quantum, clip=beyond)
 
 
-def psnr_search(settings: TileSettings, slope: float = SLOPE) -> PsnrSearch:
+def psnr_search(settings: TileSettings) -> PsnrSearch:
     """Begin a search for the step of a PSNR within the steps that the settings allow."""
     data_range = settings.high - settings.low
-    return PsnrSearch(data_range * MIN_STEP_SHARE, data_range * MAX_STEP_SHARE, slope)
+    return PsnrSearch(data_range * MIN_STEP_SHARE, data_range * MAX_STEP_SHARE)
 
 
 def require_reach(goal: Goal, settings: TileSettings, outcome: Outcome) -> None:
@@ -668,29 +599,24 @@ def find_step(
     coding: Coding,
     goal: Goal,
     *,
-    tries: int = 5,
-    tried: list[Outcome] | None = None,
-    precision: Precision = EXACT,
+    tries: int,
 ) -> tuple[TileSettings, Outcome]:
     """Return settings with the step that keeps the promise on the sample, and their outcome.
 
     Of the steps that keep a strict bound, it is the one that costs least.
 
     tries: number of trials for a PSNR; the other searches derive theirs from it.
-    tried: list to which a search for a PSNR appends all its outcomes.
-    precision: of a search for a PSNR.
 
     Raises InputError for a ratio that is out of reach.
     """
     if goal.psnr is not None:
         if goal.data_range == 0:
             return settings, sample.run(settings, coding)
-        outcomes = [] if tried is None else tried
-        return _step_for_psnr(sample, settings, coding, goal, tries, outcomes, precision)
+        return _step_for_psnr(sample, settings, coding, goal, tries)
     if goal.error is not None:
         if goal.error == 0:
             return settings, sample.run(settings, replace(coding, error=0.0))
-        return _step_for_bound(sample, settings, coding, goal, goal.error, quick=tries <= 2)
+        return _step_for_bound(sample, settings, coding, goal, goal.error)
     assert goal.size is not None
     if goal.size < MIN_SIZE_SHARE * goal.overhead:
         raise InputError(
@@ -702,43 +628,31 @@ def find_step(
 
 
 def _step_for_psnr(
-    sample: Sample,
-    settings: TileSettings,
-    coding: Coding,
-    goal: Goal,
-    tries: int,
-    tried: list[Outcome],
-    precision: Precision,
+    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, tries: int
 ) -> tuple[TileSettings, Outcome]:
     """Search for the step of the PSNR of a goal; the trial nearest to it."""
     assert goal.psnr is not None
-    target, slope = goal.psnr + precision.aim, precision.slope
-    secants = psnr_search(settings, SLOPE if slope is None else slope.slope)
+    target, secants = goal.psnr + STEP_AIM, psnr_search(settings)
 
     def run(settings: TileSettings) -> tuple[TileSettings, Outcome]:
-        tried.append(sample.run(settings, coding))
-        if slope is not None:
-            slope.note(settings.step, tried[-1].psnr(goal.data_range))
-        return settings, tried[-1]
+        return settings, sample.run(settings, coding)
 
     def following(trial: tuple[TileSettings, Outcome], _number: int) -> TileSettings | None:
         reached = trial[1].psnr(goal.data_range)
-        if abs(reached - target) < precision.close or math.isinf(reached):
+        if abs(reached - target) < CLOSE or math.isinf(reached):
             return None
         return replace(trial[0], step=secants.after(trial[0].step, reached, target))
 
     def missed(trial: tuple[TileSettings, Outcome]) -> float:
         return abs(trial[1].psnr(goal.data_range) - target)
 
-    if slope is not None:
-        slope.restart()
     return search(
         run(settings), following, run, tries - 1, lambda new, best: missed(new) < missed(best)
     )
 
 
 def _step_for_bound(
-    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, error: float, *, quick: bool
+    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, error: float
 ) -> tuple[TileSettings, Outcome]:
     """Search for the step at which coefficients and residual together cost least."""
     dtype = sample.blocks.dtype
@@ -766,7 +680,7 @@ def _step_for_bound(
     # Rounded up: with a head, a smaller step could need float64.
     number = math.ceil(STEPS_TO_OCTAVE * math.log2(plain / error) - 1e-6)
     start = min(max(number, 0), MAX_STEP_NUMBER)
-    return cheapest(run, start, MAX_STEP_NUMBER, strides=(2,) if quick else (2, 1))
+    return cheapest(run, start, MAX_STEP_NUMBER, strides=(2, 1))
 
 
 def _step_for_size(

@@ -10,13 +10,12 @@ from threading import Event
 from typing import NamedTuple
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
-from fhash_codec.compact.goal import EXACT, octave_gain, step_after_gain
+from fhash_codec.compact.goal import EXCHANGE, STEP_AIM, step_after_gain
 from fhash_codec.compact.head_training import (
     Budget,
     Pair,
     Shape,
     TrainedHead,
-    foretold_gain,
     train_head,
 )
 from fhash_codec.compact.sample import Sample
@@ -128,14 +127,16 @@ StepSearch = Callable[[TileSettings], tuple[TileSettings, Outcome]]
 """Search for the step that keeps the promise, from that of the settings on."""
 TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
-NEAR_GAIN = 0.2
-"""Gain in dB below which a head may be trained on the decoded values of its trial."""
 UNUSUAL = 1.0
 """dB by which tiles may lose more or less than a head gains, before another step is looked for."""
 FARTHEST = 2.0
 """Power of the usual factor of the step that is taken at most where tiles lose less."""
 POINTLESS = 0.005
 """Share of the bytes that a head must cost before the step is searched: then it is left out."""
+LEAST_OCTAVE = 2.0
+"""Fewest dB that an octave of bytes is believed to buy."""
+MOST_OCTAVE = 12.0
+"""Most dB that it is believed to buy."""
 CLOSE = 0.004
 """Distance in dB from the PSNR that is searched for at which no further step is tried."""
 
@@ -151,6 +152,7 @@ class _Candidate(NamedTuple):
 def choose_head(
     task: PlanTask,
     attempt: Attempt,
+    foretold: float,
     find_step: StepSearch,
     look: Callable[[TileSettings], Outcome],
 ) -> tuple[TileSettings, Outcome, HeadHistory]:
@@ -160,39 +162,36 @@ def choose_head(
     training history of the best head, empty if none was trained.
 
     attempt: without a head.
+    foretold: gain in dB of least squares.
     find_step: search for the step that keeps the promise with a head.
     look: codes the sample once, as that search does.
     """
     sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
     data_range, spent = task.goal.data_range, EFFORTS[task.config.effort]
     # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
-    aim = None if task.goal.psnr is None else task.goal.psnr + EXACT.aim
+    aim = None if task.goal.psnr is None else task.goal.psnr + STEP_AIM
 
     def train(shape: Shape, budget: Budget, tell: Callable[[float], None]) -> TrainedHead | None:
         low, high, seed = settings.low, settings.high, task.config.seed
         return train_head(pairs, low, high, shape, budget, seed=seed, progress=tell)
 
-    with stage("head trial", "gain of least squares, by which heads are chosen"):
-        pairs = training_pairs(sample, settings, attempt.coding)
-        foretold = foretold_gain(pairs, settings.low, settings.high, task.config.seed)
-    if foretold < LEAST_GAIN:
-        skip("head", f"least squares gain {foretold:.2f} dB: no head would save enough")
-        return settings, outcome, []
     gain = GAIN_OF_HEAD * foretold
-    octave = octave_gain(attempt.tried, data_range)
-    shapes = likely_heads(outcome.size, gain, octave, spent)
+    shapes = likely_heads(outcome.size, gain, EXCHANGE, spent)
     if not shapes:
         skip("head", f"least squares gain {foretold:.2f} dB: no head would save enough")
         return settings, outcome, []
     why = f"at effort {task.config.effort}; least squares gain {foretold:.2f} dB"
     with stage("head", why):
         # A head is trained on what it will meet: coarser data, which it lifts to the promise.
-        coarser = replace(settings, step=step_after_gain(settings.step, gain))
+        coarser, octave = replace(settings, step=step_after_gain(settings.step, gain)), EXCHANGE
         if aim is not None:
-            lost = outcome.psnr(data_range) - look(coarser).psnr(data_range)
+            other = look(coarser)
+            lost = outcome.psnr(data_range) - other.psnr(data_range)
+            if lost > 0 and outcome.size > other.size:
+                octave = lost / math.log2(outcome.size / max(other.size, 1))
+                octave = min(max(octave, LEAST_OCTAVE), MOST_OCTAVE)
             coarser = _coarsened(settings, coarser, lost, gain)
-        if gain > NEAR_GAIN or not sample.complete:
-            pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
+        pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
 
         def train_fully(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
             return train(shape, spent.budget_of(shape), tell)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.attempt import sub_tile
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Tile
 from fhash_codec.compact.transform import gram_of, usual_transform
@@ -26,32 +25,24 @@ from fhash_formats.transform.predict import (
 )
 from fhash_formats.transform.spec import encode_block
 from fhash_formats.transform.tile import predicted_size
-from fhash_formats.transform.tile_format import Shape, TileSettings
+from fhash_formats.transform.tile_format import TileSettings
 
 ORDERS = ((0, 1, 2, 3), (0, 3, 2, 1), (3, 2, 1, 0))
 """Orders in which axes are refined: the last axis is predicted best and makes half of all."""
+PLAIN_ORDERS = ((0, 1, 2, 3), (3, 2, 1, 0))
+"""Those that are tried without weights."""
 DEPTHS = ((2, 3, 3, 3), (0, 3, 3, 3))
 """Refinements along each axis (t, z, y, x) that are tried."""
 ROWS = 30_000
 """Vertices of a pass that its weights are trained on."""
 TRIAL_ROWS = 8_000
 """Vertices of a pass that its weights are trained on for a trial."""
-HOPELESS = 1.3
+HOPELESS = 1.1
 """Size of the first trial, as a multiple of the rival's, from which on no other trial helps."""
-HOPELESS_PARTS = 1.1
-"""The same for the parts of tiles, which tell more of a series that they are tried for."""
-LOST = 1.015
-"""Such a multiple of the best trial of parts from which on not all tiles are coded."""
 ROUNDS = 4
 """Rounds of the reweighted least squares."""
 MAX_TRAINING_VERTICES = 48 << 20
 """Vertices of a series up to which the weights are trained on all of its tiles."""
-TRIAL_VERTICES = 4 << 20
-"""Vertices of the tiles that are coded by each trial."""
-QUICK_VERTICES = 1 << 20
-"""The same where seconds count, in the middle of each of these tiles."""
-FEWEST = 1 << 14
-"""Vertices in the middle of a tile that tell something of it."""
 RIDGE = 1e-3
 """Ridge of the least squares, as a share of the mean of the diagonal."""
 MAX_INTEGER_BOUND = 2.0**40
@@ -71,19 +62,20 @@ class IntegerTile(NamedTuple):
 
 def choose_predictor(
     sample: Sample,
+    parts: Sample,
     settings: TileSettings,
-    size: int,
+    rival: float,
     *,
     error: float,
     effort: int,
-    quick: bool = False,
-) -> tuple[TileSettings, int] | None:
-    """Return settings with a predictor, and the bytes of all tiles, if that is less than `size`.
+) -> TileSettings | None:
+    """Return settings with a predictor if it takes fewer bytes of some parts than a rival.
 
-    size: bytes of all tiles by the transform.
+    sample: of the series, in tiles; its weights are trained on.
+    parts: of the tiles, which are coded.
+    rival: bytes of all parts by the transform.
     error: strict bound in data units. The residual's quantum, which keeps the bound, is also the
         distance of predicted values.
-    quick: whether trials are those of parts of tiles.
     """
     step, origin = settings.quantum, settings.center
     if sample.blocks.dtype.kind in "iu" and error < MAX_INTEGER_BOUND:
@@ -91,42 +83,39 @@ def choose_predictor(
         step, origin = 2.0 * int(error) + 1.0, float(round(settings.center))
     if step <= 0:
         return None
-    best = best_predictor(sample, step=step, origin=origin, effort=effort, rival=size, quick=quick)
-    if best is None or best[1] >= size:
+    predictor = best_predictor(sample, parts, step=step, origin=origin, effort=effort, rival=rival)
+    if predictor is None:
         return None
-    predictor, predicted_size = best
     # The transform is unused from here on; store the cheapest description of one.
-    plain = usual_transform(sample.tiles[0].values.shape)
-    settings = replace(settings, predictor=predictor, transform=plain, head=None)
+    plain = usual_transform(sample.blocks.tile)
     # Predicted values are within the range as they are.
-    return replace(settings, clip=False), predicted_size
+    return replace(settings, predictor=predictor, transform=plain, head=None, clip=False)
 
 
 def best_predictor(
     sample: Sample,
+    parts: Sample,
     *,
     step: float,
     origin: float,
     effort: int,
     rival: float = math.inf,
-    quick: bool = False,
-) -> tuple[Predictor, int] | None:
-    """Return the predictor of the smallest streams, and the approximate bytes of all tiles by it.
+) -> Predictor | None:
+    """Return the predictor of the smallest streams of some parts.
 
     Order, depth and taps are decided one after the other. Weights are trained on all tiles of a
-    series that is in memory and not too large, and tried on some of them, since a few tiles are
-    often not like the others.
+    series that is in memory and not too large, since a few tiles are often not like the others.
 
-    Returns None if the integers would be too large, or if the first trial says that more bytes
-    than those of the rival will be needed.
+    Returns None if the integers would be too large, or if the parts take more bytes than by the
+    rival.
 
+    sample, parts: see `choose_predictor`.
     step, origin: distance of predicted values, and one of them, in data units.
-    rival: bytes of all tiles by what the predictor competes with.
-    quick: see `choose_predictor`.
+    rival: bytes of all parts by what the predictor competes with.
     """
     plain = _predictor(step, origin, (0, 0, 0, 0), ORDERS[0], 0, None)
-    tiles = sample.map(lambda tile: _quantised(tile, plain))
-    training_tiles = tiles
+    coded = parts.map(lambda tile: _quantised(tile, plain))
+    training_tiles = coded
     if sample.blocks.in_memory and prod(sample.blocks.shape) <= MAX_TRAINING_VERTICES:
         training_tiles = list(sample.map_all(lambda tile: _quantised(tile, plain)))
     training = [
@@ -134,80 +123,46 @@ def best_predictor(
         for tile in training_tiles
         if tile is not None and (tile.counted is None or tile.counted.any())
     ]
-    codable = [tile for tile in tiles if tile is not None]
-    if not training or len(codable) < len(tiles):
+    codable = [tile for tile in coded if tile is not None]
+    if not training or len(codable) < len(coded):
         return None
-    trials = _Trials(sample, training, step, origin, quick=quick)
-    best = trials.run(DEPTHS[0], ORDERS[0], 1)
-    if best[0] > (HOPELESS_PARTS if quick else HOPELESS) * rival:
-        return None
-    for order in ORDERS[1:] if effort > 2 else ():
-        best = min(best, trials.run(DEPTHS[0], order, 1), key=lambda pair: pair[0])
-        sample.tick()
-    for levels in DEPTHS[1:] if effort > 2 else ():
-        best = min(best, trials.run(levels, best[1].order, 1), key=lambda pair: pair[0])
-        sample.tick()
-    for reach in (0, 2) if effort > 3 else ():
-        trial = trials.run(best[1].levels, best[1].order, reach)
-        best = min(best, trial, key=lambda pair: pair[0])
-        sample.tick()
-    if quick and best[0] > LOST * rival:
-        return None
-    chosen = best[1]
-    predictor = _predictor(step, origin, chosen.levels, chosen.order, chosen.reach, training)
-    sizes = _coded_sizes(codable, predictor)
-    size = sum(weight * n for weight, n in zip(sample.weights, sizes, strict=True))
-    return predictor, size + _weight_bytes(predictor)
 
-
-class _Trials:
-    """Trials of predictors on some of the training tiles."""
-
-    def __init__(
-        self,
-        sample: Sample,
-        training: list[IntegerTile],
-        step: float,
-        origin: float,
-        *,
-        quick: bool,
-    ) -> None:
-        vertices = sum(tile.integers.size for tile in training)
-        self._training = training
-        self._tiles = training[:: -(-vertices // TRIAL_VERTICES)]
-        if quick:
-            part = sub_tile(
-                training[0].integers.shape, max(QUICK_VERTICES // len(self._tiles), FEWEST)
-            )
-            self._tiles = [_middle(tile, part) for tile in self._tiles]
-        self._step, self._origin = step, origin
-        counted = sum(
-            tile.integers.size if tile.counted is None else int(np.count_nonzero(tile.counted))
-            for tile in self._tiles
-        )
-        self._factor = sample.counted / counted  # from bytes of these tiles to those of all
-
-    def run(self, levels: Axes, order: Axes, reach: int) -> tuple[float, Predictor]:
-        """Train a predictor and code the tiles; the approximate bytes of all tiles by it."""
+    def run(levels: Axes, order: Axes, reach: int, rows: int = TRIAL_ROWS) -> _Trial:
+        """Code the parts by a predictor whose weights are trained on some rows; by 0 if none."""
         t, z, y, x = (
             min(level, (length - 1).bit_length())
-            for level, length in zip(levels, self._tiles[0].integers.shape, strict=True)
+            for level, length in zip(levels, codable[0].integers.shape, strict=True)
         )
-        predictor = _predictor(
-            self._step, self._origin, (t, z, y, x), order, reach, self._training, TRIAL_ROWS
-        )
-        size = sum(_coded_sizes(self._tiles, predictor)) * self._factor
-        return size + _weight_bytes(predictor), predictor
+        tiles = training if rows else None
+        predictor = _predictor(step, origin, (t, z, y, x), order, reach, tiles, rows)
+        sizes = zip(parts.weights, _coded_sizes(codable, predictor), strict=True)
+        parts.tick()
+        return _Trial(sum(w * n for w, n in sizes) + _weight_bytes(predictor), predictor)
+
+    # The mean of two neighbours is best at sharp fronts: all others smear them.
+    plain_trials = [run(levels, order, 0, rows=0) for order in PLAIN_ORDERS for levels in DEPTHS]
+    best = run(DEPTHS[0], ORDERS[0], 1)
+    mean = min(plain_trials, key=lambda trial: trial.size)
+    if min(best.size, mean.size) > HOPELESS * rival:
+        return None
+    for order in ORDERS[1:] if effort > 2 else ():
+        best = min(best, run(DEPTHS[0], order, 1), key=lambda trial: trial.size)
+    for levels in DEPTHS[1:] if effort > 2 else ():
+        best = min(best, run(levels, best.predictor.order, 1), key=lambda trial: trial.size)
+    for reach in (0, 2) if effort > 3 else ():
+        levels, order = best.predictor.levels, best.predictor.order
+        best = min(best, run(levels, order, reach), key=lambda trial: trial.size)
+    if mean.size < best.size:
+        return mean.predictor if mean.size < rival else None
+    last = run(best.predictor.levels, best.predictor.order, best.predictor.reach, ROWS)
+    return last.predictor if last.size < rival else None
 
 
-def _middle(tile: IntegerTile, part: Shape) -> IntegerTile:
-    """Return the middle of a tile."""
-    middle = tuple(
-        slice(first := max(0, (length - short) // 2), first + short)
-        for length, short in zip(tile.integers.shape, part, strict=True)
-    )
-    counted = None if tile.counted is None else np.ascontiguousarray(tile.counted[middle])
-    return IntegerTile(np.ascontiguousarray(tile.integers[middle]), counted)
+class _Trial(NamedTuple):
+    """A predictor, and the bytes that all tiles take by it."""
+
+    size: float
+    predictor: Predictor
 
 
 def _coded_sizes(tiles: list[IntegerTile], predictor: Predictor) -> list[int]:

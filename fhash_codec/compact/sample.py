@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from itertools import pairwise
 from math import prod
 from typing import NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
@@ -28,13 +26,10 @@ from fhash_codec.compact.tiles import (
     recoded,
     total,
 )
-from fhash_codec.features.features import Feature, Interval, Isosurface, Segmentation
 from fhash_formats.support.threads import map_ahead
 from fhash_formats.support.values import Values
-from fhash_formats.transform.spec import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
-from fhash_formats.transform.tile import WEIGHT, filled, foretell, forward, plain_step
+from fhash_formats.transform.tile import filled
 from fhash_formats.transform.tile_format import TileSettings
-from fhash_formats.transform.values import all_finite
 
 
 def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
@@ -62,15 +57,16 @@ def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
     with np.errstate(over="ignore", invalid="ignore"):
         target = np.where(finite, values, 0).astype(settings.dtype) - center
         filling = filled(target, counted, finite, settings, density) + center
-        # Beyond the range there is nothing to gain, and a type may have no such numbers.
-        filling = np.clip(filling, settings.low, settings.high)
+        # Values beyond the range take fewer bytes, and readers clip them; integers may have none.
+        beyond = settings.high - settings.low if values.dtype.kind == "f" else 0
+        filling = np.clip(filling, settings.low - beyond, settings.high + beyond)
         if values.dtype.kind != "f":
             filling = np.rint(filling)
         return Tile(np.where(counted, values, filling.astype(values.dtype)), counted)
 
 
 Result = TypeVar("Result")
-Grams = dict[tuple[int, float, int | None], npt.NDArray[np.float64]]
+Grams = dict[tuple[int, float], npt.NDArray[np.float64]]
 """Products of lines by axis and centre."""
 _grams: WeakKeyDictionary[Blocks, Grams] = WeakKeyDictionary()
 
@@ -223,22 +219,6 @@ class Sample:
         other = Sample(self.blocks, max_vertices, self._pool, self._costs, self.tick)
         return other if self._filling is None else other.filled(*self._filling)
 
-    def narrowed(self, max_vertices: int) -> Sample:
-        """Return a sample of those of its tiles in the middle, of at most so many vertices.
-
-        At least one is left. Only their bytes beside each other mean anything. A sample of no more
-        is returned itself, with what is known of it.
-        """
-        count = _tiles_of(self.blocks, max_vertices)
-        if count >= len(self.tiles):
-            return self
-        first = max(0, (len(self.tiles) - count) // 2)
-        other = copy(self)
-        other.tiles = self.tiles[first : first + count]
-        other.weights = self.weights[first : first + count]
-        other._known = Known()
-        return other
-
     def filled(self, settings: TileSettings, density: int) -> Sample:
         """Return the same tiles, filled for these settings (see `fill`) from the source."""
         if self.blocks.complete:
@@ -320,82 +300,6 @@ class Sample:
             yield result
 
 
-MAX_PRICED_EFFORT = 5
-"""Largest effort at which transforms are priced, and only the best of them coded."""
-WIDE = 8.0
-"""Quanta of the residual in a root mean squared error from which on its entropy is that of a normal
-distribution of numbers that are not rounded."""
-
-
-class PricedSample(Sample):
-    """A sample whose tiles are priced, and not coded.
-
-    Sizes and errors are those that the fast coder foretells, for all vertices of a tile. Only
-    transforms are compared by them.
-
-    Attributes:
-        sample: the same sample, which codes its tiles.
-    """
-
-    def __init__(self, sample: Sample) -> None:
-        vars(self).update(vars(sample))
-        self.sample = sample
-
-    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
-        """Return what is foretold of the series for each pair of settings and coding.
-
-        All trials run at once, as those of a `Sample`.
-        """
-        jobs = [(tile, *trial) for trial in trials for tile in self.tiles]
-        prices = list(self._ticking(self._pool.map(lambda job: _price(*job), jobs)))
-        number = len(self.tiles)
-        return [
-            total(prices[start : start + number], self.weights)
-            for start in range(0, len(prices), number)
-        ]
-
-
-def priced(sample: Sample, settings: TileSettings, effort: int) -> Sample:
-    """Return a sample on which transforms are compared: a priced one where that can be.
-
-    That is up to MAX_PRICED_EFFORT, where all vertices count and are coded by transform in float32.
-    """
-    plain = not (settings.double or settings.labels or settings.origin)
-    can_be = effort <= MAX_PRICED_EFFORT and plain and sample.blocks.complete
-    return PricedSample(sample) if can_be else sample
-
-
-def _price(tile: Tile, settings: TileSettings, coding: Coding) -> Outcome:
-    """Return the size and error that a tile is likely to have."""
-    values = tile.values.astype(np.float32) - np.float32(settings.center)
-    if not all_finite(values):
-        np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    coefficients, step = forward(values, settings), plain_step(settings)
-    size, squares = foretell(coefficients, settings, 1 / step, WEIGHT)
-    squares *= step * step
-    if coding.error:
-        size += _residual_bytes(math.sqrt(squares / values.size), settings.quantum) * values.size
-    return Outcome(size=round(size), squares=squares, count=values.size, max_error=0.0)
-
-
-def _residual_bytes(error: float, quantum: float) -> float:
-    """Return the bytes for each vertex of normal errors that are rounded to a quantum.
-
-    error: root of the mean squared error, in the units of the quantum.
-    """
-    sigma = error / quantum
-    if sigma > WIDE:
-        return math.log2(sigma * math.sqrt(2 * math.pi * math.e)) / 8
-    reach = math.ceil(8 * sigma)
-    below = [
-        math.erf((number - 0.5) / (math.sqrt(2) * max(sigma, 1e-9)))
-        for number in range(-reach, reach + 2)
-    ]
-    shares = np.diff(below) / 2
-    shares = shares[shares > 0]
-    return float(-(shares * np.log2(shares)).sum()) / 8
-
-
 def _choose_tiles(tiles: int, count: int, costs: Sequence[float] | None) -> list[tuple[int, int]]:
     """Choose `count` of the tiles; pairs as of `strata`."""
     if count == tiles:
@@ -405,128 +309,3 @@ def _choose_tiles(tiles: int, count: int, costs: Sequence[float] | None) -> list
     # In C order: a reader of a large series keeps one layer of tiles only.
     weights = [tiles * (place + 1) // count - tiles * place // count for place in range(count)]
     return list(zip(sorted(spread_order(tiles)[:count]), weights, strict=True))
-
-
-EDGE_OFFSETS = {
-    1: (0, 0.15, 0.35, 0.6, 1, 1.5, 2.2, 3.2),
-    2: (0, 0.4, 1, 2.2),
-    5: (0, 0.8),
-    MAX_EDGES: (0,),
-}
-"""Edges to both sides of a threshold, in errors, by the largest number of thresholds for them."""
-MIN_PROBABILITY = 2.0**-16
-"""Smallest probability that a score expresses."""
-CLASSES = 16
-"""Number of classes of values where scores are learned."""
-
-
-def mask_levels(
-    features: Sequence[Feature], dilation: int, error: float, tiles: Iterable[Tile]
-) -> MaskLevels:
-    """Return the scores for features.
-
-    Features without thresholds, or with too many of them, are learned from tiles.
-
-    features: what was selected.
-    dilation: vertices by which the features were grown.
-    error: root of the mean squared error of the decoded values, in data units.
-    tiles: tiles of a sample.
-    """
-    reach = min(dilation, MAX_REACH)
-    error = max(error, 1e-30)
-    if len(features) == 1 and isinstance(features[0], Isosurface):
-        return _isosurface_levels(features[0].value, reach, error)
-    spans = [_span(feature) for feature in features]
-    thresholds = sorted(
-        {end for span in spans if span is not None for end in span if math.isfinite(end)}
-    )
-    if None in spans or not 1 <= len(thresholds) <= MAX_EDGES:
-        return _learned_levels(tiles)
-    edges = _edges(thresholds, error)
-    outside = [
-        math.prod(
-            1 - _normal((high - center) / error) + _normal((low - center) / error)
-            for low, high in filter(None, spans)
-        )
-        for center in _centers(edges, error)
-    ]
-    return MaskLevels(edges=edges, scores=tuple(_score(1 - p) for p in outside), reach=reach)
-
-
-def _isosurface_levels(value: float, reach: int, error: float) -> MaskLevels:
-    """Return the scores that a vertex lies above and below an isosurface."""
-    edges = _edges([value], error)
-    above = [_normal((center - value) / error) for center in _centers(edges, error)]
-    return MaskLevels(
-        edges=edges,
-        scores=tuple(_score(p) for p in above),
-        others=tuple(_score(1 - p) for p in above),
-        reach=max(reach, 1),
-    )
-
-
-def _span(feature: Feature) -> tuple[float, float] | None:
-    """Return the interval of values that a feature selects; None if it selects otherwise."""
-    if isinstance(feature, Interval):
-        return feature.low, feature.high
-    if isinstance(feature, Segmentation) and feature.threshold is not None:
-        return feature.threshold, math.inf
-    return None
-
-
-def _edges(thresholds: list[float], error: float) -> tuple[float, ...]:
-    """Return the edges of the classes of values around thresholds."""
-    offsets = EDGE_OFFSETS[min(count for count in EDGE_OFFSETS if count >= len(thresholds))]
-    edges = {
-        _rounded(threshold + sign * offset * error)
-        for threshold in thresholds
-        for offset in offsets
-        for sign in (-1, 1)
-    }
-    return tuple(sorted(edges))[:MAX_EDGES]
-
-
-def _centers(edges: tuple[float, ...], error: float) -> list[float]:
-    """Return a value that stands for each class."""
-    inner = [low + (high - low) / 2 for low, high in pairwise(edges)]
-    return [edges[0] - 0.8 * error, *inner, edges[-1] + 0.8 * error]
-
-
-def _learned_levels(tiles: Iterable[Tile]) -> MaskLevels:
-    """Return scores by the share of vertices that count in each of some classes of equal size."""
-    tiles = list(tiles)
-    values = np.concatenate([tile.values.ravel() for tile in tiles])
-    counted = np.concatenate(
-        [
-            np.ones(tile.values.size, bool) if tile.counted is None else tile.counted.ravel()
-            for tile in tiles
-        ]
-    )
-    finite = np.isfinite(values)
-    values, counted = values[finite].astype(np.float64), counted[finite]
-    if not values.size:
-        return MaskLevels()
-    quantiles = np.quantile(values, np.arange(1, CLASSES) / CLASSES)
-    edges = tuple(sorted({_rounded(float(edge)) for edge in quantiles}))
-    classes = np.searchsorted(edges, values, side="right")
-    sizes = np.bincount(classes, minlength=len(edges) + 1)
-    counted_sizes = np.bincount(classes, weights=counted, minlength=len(edges) + 1)
-    shares = counted_sizes / np.maximum(sizes, 1)
-    return MaskLevels(edges=edges, scores=tuple(_score(float(p)) for p in shares))
-
-
-def _score(p: float) -> int:
-    """Return the score of a probability that a vertex counts."""
-    return round(-UNIT * math.log2(max(1 - p, MIN_PROBABILITY)))
-
-
-def _normal(deviation: float) -> float:
-    """Return the standard normal distribution function."""
-    if not math.isfinite(deviation):
-        return float(deviation > 0)
-    return 0.5 * (1 + math.erf(deviation / math.sqrt(2)))
-
-
-def _rounded(value: float) -> float:
-    """Return a value of few digits: the settings are stored as text."""
-    return float(f"{value:.7g}")

@@ -155,26 +155,6 @@ class Blocks:
         with self._box.lock:
             self._box.content = self._box.layer = None
 
-    def window(self, shape: Shape) -> Blocks:
-        """Return a part of the box over some steps, as one tile in memory: where values vary most.
-
-        shape: of the part, at most that of the box.
-        """
-        first = (self.shape[0] - shape[0]) // 2
-        middle = first + shape[0] // 2
-        values, counted = self._steps(range(middle, middle + 1))
-        frame = Tile(values[0], None if counted is None else counted[0])
-        places = product(
-            *(
-                sorted({0, (length - n) // 2, length - n})
-                for length, n in zip(self.shape[1:], shape[1:], strict=True)
-            )
-        )
-        z, y, x = max(
-            places, key=lambda place: _variation(frame, _region((0, *place), (1, *shape[1:]))[1:])
-        )
-        return self.boxes(shape, [(first, z, y, x)], [prod(self.shape) // prod(shape)])
-
     def boxes(self, shape: Shape, places: Sequence[Index], weights: Sequence[int]) -> Blocks:
         """Return parts of one shape as a series in memory of its own, each of them one tile.
 
@@ -299,16 +279,6 @@ class Blocks:
 def _region(place: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
     """Return the slices of a part by its first vertices."""
     return tuple(slice(low, low + n) for low, n in zip(place, shape, strict=True))
-
-
-def _variation(frame: Tile, region: tuple[slice, ...]) -> float:
-    """Return how much counted values of a region (z, y, x) of a step differ from neighbours."""
-    values, counted = frame
-    with np.errstate(all="ignore"):
-        part = values[region].astype(np.float64)
-        if counted is not None:
-            part[~counted[region]] = np.nan
-        return float(sum(np.nansum(np.abs(np.diff(part, axis=axis))) for axis in range(part.ndim)))
 
 
 MIN_STEP_SHARE = 2.0**-26

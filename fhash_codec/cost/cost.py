@@ -25,7 +25,7 @@ from fhash_codec.cost.plan import (
     options_of,
     wishes,
 )
-from fhash_codec.cost.prediction import predictor
+from fhash_codec.cost.prediction import Predictor
 from fhash_codec.cost.probe import probe_paper
 from fhash_codec.cost.results import (
     DEFAULT,
@@ -123,10 +123,10 @@ def measure_cost(
         peers = PeerEncodings(series, facts, Path(folder), allowance, progress)
         reads: list[Read] = []
         pictures: list[Picture] = []
-        with predictor(series) as foretold:
-            own = OwnEncodings(series, Path(folder), allowance, foretold.predict, progress)
-            with allowance.work("further encodings"):
-                _encode(own, peers, allowance, features)
+        predict = Predictor(series).predict
+        own = OwnEncodings(series, Path(folder), allowance, predict, progress)
+        with allowance.work("further encodings"):
+            _encode(own, peers, allowance, features)
         if not allowance.interrupted:
             with allowance.work("further reads and pictures"):
                 measure_uses(series, facts, own.files, allowance, progress, reads, pictures)
@@ -179,8 +179,7 @@ def _measurable(
     share = select_features(part, config, silent).extent.samples / extent.samples
     network = replace(config, profile="paper")
     progress("predicting", 0, 1, "")
-    with predictor(part) as foretold:
-        lattice = ADVICE_ENCODINGS * foretold.predict(config).seconds / share
+    lattice = ADVICE_ENCODINGS * Predictor(part).predict(config).seconds / share
     probe = None
     with suppress(FhashError):  # told where the network is encoded
         probe = probe_paper(part, share, network)

@@ -27,7 +27,7 @@ from fhash_codec.cost.plan import (
     facts_of,
     options_of,
 )
-from fhash_codec.cost.prediction import Prediction, predictor
+from fhash_codec.cost.prediction import Prediction, Predictor
 from fhash_codec.cost.probe import reported
 from fhash_codec.cost.results import Curve, Encoded, seconds_text
 from fhash_codec.encoding import encode
@@ -370,8 +370,7 @@ def _foretold(
     prices: Sequence[ModelPrice], series: Series, config: EncodeConfig
 ) -> list[ModelPrice]:
     """Prices of a crop with the lattice's bytes by its prediction, and the network's likewise."""
-    with predictor(series) as one:
-        told = one.predict(config.of_profile("compact"))
+    told = Predictor(series).predict(config.of_profile("compact"))
     lattice = prices[0]
     if told.bytes is None:
         return list(prices)

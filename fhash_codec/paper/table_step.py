@@ -14,11 +14,12 @@ import numpy.typing as npt
 
 from fhash_codec.compact.goal import Bracket, geometric_mean, search
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, Tile, code
-from fhash_codec.compact.transform import Gram, Result, choose_transform, usual_transform
+from fhash_codec.compact.transform import Gram, Result, usual_transform
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.network import Architecture, Layer, Network
 from fhash_codec.paper.storage import Bricks, component_name
+from fhash_codec.paper.table_transform import choose_transform
 from fhash_codec.paper.tables import (
     ROUNDS,
     Index,
@@ -195,7 +196,7 @@ def _with_best_transforms(
             continue
         trials = _Trials(table, coding, component, workers)
         how = Coding(weight=WEIGHT, rounds=0 if trials.allows_bases else ROUNDS)
-        chosen.append(choose_transform(trials, settings, how)[0])
+        chosen.append(choose_transform(trials, settings, how))
     return replace(coding, settings=tuple(chosen))
 
 
@@ -214,7 +215,7 @@ class _Trials:
         counts = [int(np.count_nonzero(table.needed(region))) for region in self._regions]
         self._complete = sum(counts) == prod(table.shape[:4])
         self.tiles = [self._tile(self._regions[counts.index(max(counts))])]
-        self.grams: dict[tuple[int, float, int | None], Gram] = {}
+        self.grams: dict[tuple[int, float], Gram] = {}
 
     @property
     def allows_bases(self) -> bool:

@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 19
+ABI_VERSION = 20
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -60,7 +60,6 @@ _TILES: Prototypes = {
     "fhash_tile_part": (*_TILE, *(ARRAY,) * 4),
     "fhash_tile_fill": (*_TILE, ARRAY, ARRAY, ctypes.c_int32, ARRAY, ARRAY),
     "fhash_tile_forward": (*_TILE, *(ARRAY,) * 3),
-    "fhash_tile_foretell": (*_TILE, ARRAY, REAL, REAL, ARRAY, ARRAY),
     "fhash_tile_foretold": (*_TILE, *(ARRAY,) * 4),
     "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
     "fhash_plan": (*(ARRAY,) * 4,),

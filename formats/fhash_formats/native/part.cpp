@@ -139,25 +139,6 @@ FHASH_KERNEL int32_t fhash_tile_forward(fhash_context* context, const fhash_tile
 }
 
 // The bytes that the fast coder would take for coefficients, and the sum of squared errors in
-// squared steps: results. scale: 1 / quantiser step. weight: squared steps that a bit is worth.
-FHASH_KERNEL int32_t fhash_tile_foretell(fhash_context* context, const fhash_tile* tile,
-                                         const float* coefficients, double scale, double weight,
-                                         double* results, fhash_error* error) {
-    return reported(error, [&](fhash_error& failed) {
-        return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
-            const auto plan = plan_for<float>(*context, *settings, shape, 0, failed);
-            if (!plan) return false;
-            const FastPrior& prior = fast_prior();
-            const int64_t bands = (int64_t)plan->table.size() / TABLE_COLUMNS;
-            return kernel_done(fhash_fast_encode(nullptr, coefficients, 0, scale, weight,
-                                                 shape.data(), plan->table.data(), bands,
-                                                 prior.slots.data(), prior.defaults.data(),
-                                                 nullptr, 0, results),
-                               "the fast coder", failed);
-        });
-    });
-}
-
 // The table of a tile less its origin: see decode_tile_table.
 //
 // values: room for float64 numbers. wide: gets whether they are float64; else they are float32.

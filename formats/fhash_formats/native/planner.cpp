@@ -18,12 +18,17 @@ namespace {
 
 constexpr double WEIGHT = 0.09;       // squared steps that a bit is worth
 constexpr double ERROR_PRICE = 0.8;   // squared error in squared steps that is worth a byte
+constexpr double BASIS_STEPS = 2;      // that a basis is as precise as
 constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a packed basis
 constexpr double NEAR = 1.02;         // of the cheapest on few parts: then all parts are priced
 constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
 constexpr double OCTAVES = 0.67;      // of bytes for an octave of squared errors: 4.5 dB an octave
-constexpr double MIN_SLOPE = 2, MAX_SLOPE = 12, MIN_APART = 0.01;  // that are believed
 constexpr double SLOPE = 5.5;         // dB by which the PSNR falls for a step larger by e
+constexpr double FALL = 1.2;          // octaves of bytes for a step larger by e
+constexpr double SETTLED = 0.2;         // change of the logarithm of the step, about a decibel
+constexpr int MOST_SETTLED = 5;        // prices by which a step is looked for
+constexpr double COMPARABLE = 1.5;      // dB up to which bytes of a step are corrected for it
+constexpr int MOST_STEPS = 2;          // that are tried to come so near
 constexpr double LEAST_EXTRA = 0.002;  // share of extra bytes that a block corrects
 constexpr double LEAST_TOLD = 0.5;    // bytes of cuts along an axis, as a multiple
 constexpr double MOST_FACTOR = 8;     // of the extra bytes that thin parts foretell
@@ -96,8 +101,8 @@ class Planner {
         if (task_.sheets.count) sheets = read(task_.sheets);
         Kinds kinds = usual(box_.data());
         if (!order(columns, kinds) || !order(sheets, kinds)) return false;
-        if (!settle(columns, kinds, 2)) return false;
-        if (!choose(columns, sheets, box_, 15, kinds) || !settle(columns, kinds, 1)) return false;
+        if (!settle(columns, kinds)) return false;
+        if (!choose(columns, sheets, box_, 15, kinds) || !settle(columns, kinds)) return false;
         Shape tile;
         const Set block = read(task_.block);
         if (!check_plane(block, kinds)) return false;
@@ -118,7 +123,7 @@ class Planner {
             if (!choose(columns, sheets, tile, axes, kinds)) return false;
         }
         Price found;
-        if (!settle(columns, kinds, 1) || !price(columns, columns.all, tile, {kinds}, &found))
+        if (!settle(columns, kinds) || !price(columns, columns.all, tile, {kinds}, &found))
             return false;
         for (size_t a = 0; a < 4; a++) {
             const Kind of = kinds[a];
@@ -243,7 +248,7 @@ class Planner {
         if (modes == modes_.end()) modes = modes_.emplace(key, modes_along(axis, length)).first;
         Buffer packed;
         Own& made = bases_[key];
-        if (!pack_basis(modes->second, step_, packed, error_)) return none;
+        if (!pack_basis(modes->second, BASIS_STEPS * step_, packed, error_)) return none;
         made.basis = read_basis({packed.data(), packed.data() + packed.size()}, error_);
         made.bytes = BASIS_TEXT * (double)packed.size();
         return made;
@@ -423,10 +428,11 @@ class Planner {
                                        kinds))
             return false;
         const Kind along_z = kinds[1];
+        const std::vector<Kind> of_lines = {
+            {}, line, {DAUBECHIES_KIND, 1}, {HAAR_KIND, 2}, {LEGALL_KIND, 1}};
         for (size_t axis = 0; axis < 2; axis++)
             if (axes >> axis & 1 && tile[axis] > 1 &&
-                !choose_along(columns, tile, axis,
-                              {{}, line, {HAAR_KIND, 2}, {LEGALL_KIND, 1}}, kinds))
+                !choose_along(columns, tile, axis, of_lines, kinds))
                 return false;
         if (kinds[1] == along_z || tile[0] == 1) return true;
         std::vector<Kinds> changes(1, kinds);
@@ -471,21 +477,26 @@ class Planner {
         return improve(set, tile, changes, kinds);
     }
 
-    // Looks for the step that keeps the promise.
-    bool settle(const Set& set, const Kinds& kinds, int tries) {
-        double slope = SLOPE, before_log = 0, before = 0;
-        for (int i = 0; i < tries; i++) {
+    // Looks for the step that keeps the promise, within what was too fine and too coarse before:
+    // where few coefficients hold nearly everything, the error jumps at their step.
+    bool settle(const Set& set, const Kinds& kinds) {
+        double fine = -1e9, coarse = 1e9;
+        for (int i = 0; i < MOST_SETTLED; i++) {
             Price found;
             if (!price(set, set.all, set.shape(), {kinds}, &found)) return false;
-            if (found.mean_square() <= 0) return true;
-            const double missing = 10 * std::log10(found.mean_square() / task_.mean_square);
+            double wanted;  // change of the logarithm of the step
+            if (task_.size > 0) {
+                wanted = std::log2(std::max(found.bytes, 1.0) / task_.size) / FALL;
+            } else {
+                if (found.mean_square() <= 0 || task_.mean_square <= 0) return true;
+                wanted = -10 * std::log10(found.mean_square() / task_.mean_square) / SLOPE;
+            }
             const double at = std::log(step_);
-            if (i > 0 && std::fabs(at - before_log) > MIN_APART)
-                slope = std::min(std::max((missing - before) / (at - before_log), MIN_SLOPE),
-                                 MAX_SLOPE);
-            before = missing;
-            before_log = at;
-            step_ *= std::exp(std::min(std::max(-missing / slope, -2.0), 2.0));
+            (wanted > 0 ? fine : coarse) = at;
+            double next = at + std::min(std::max(wanted, -2.0), 2.0);
+            if (next <= fine || next >= coarse) next = (fine + coarse) / 2;
+            step_ = std::exp(next);
+            if (std::fabs(wanted) < SETTLED) return true;
         }
         return true;
     }
@@ -543,9 +554,9 @@ class Planner {
                 Kinds best = kinds;
                 const std::vector<Kind> options = {{}, {DAUBECHIES_KIND, 2}, {HAAR_KIND, 2}};
                 if (length > 1 && !choose_along(few, few.shape(), 0, options, best)) return false;
-                Price found;
-                if (!price(few, few.all, few.shape(), {best}, &found)) return false;
-                cuts.steps[length] = {relative(found, whole), best[0]};
+                double of_few;
+                if (!compare(few, best, whole, of_few)) return false;
+                cuts.steps[length] = {of_few, best[0]};
             }
         }
         return true;
@@ -561,11 +572,24 @@ class Planner {
     // The cost of parts in blocks of a shape as a multiple of another one.
     bool price_ratio(const Set& set, const Shape& shape, const Kinds& kinds, const Price& uncut,
                      double& ratio) {
-        const Set parts = cut_set(set, shape);
-        Price found;
-        if (!price(parts, parts.all, shape, {kinds}, &found)) return false;
-        ratio = relative(found, uncut);
         tried_++;
+        return compare(cut_set(set, shape), kinds, uncut, ratio);
+    }
+
+    // Bytes at equal quality as a multiple of those of another price. Where cuts make all
+    // coefficients so small that none is kept, a finer step tells what they cost.
+    bool compare(const Set& set, const Kinds& kinds, const Price& other, double& ratio) {
+        const double step = step_;
+        Price found;
+        for (int i = 0;; i++) {
+            if (!price(set, set.all, set.shape(), {kinds}, &found)) return false;
+            if (found.mean_square() <= 0 || other.mean_square() <= 0 || i == MOST_STEPS) break;
+            const double worse = 10 * std::log10(found.mean_square() / other.mean_square());
+            if (std::fabs(worse) < COMPARABLE) break;
+            step_ *= std::exp(std::min(std::max(-worse / SLOPE, -2.0), 2.0));
+        }
+        step_ = step;
+        ratio = relative(found, other);
         return true;
     }
 

@@ -28,7 +28,9 @@ typedef struct fhash_plan_task {
     double vertex_ns, bit_ns; /* to decode a vertex, and each of its bits */
     double most;            /* bytes that a tile may take, as a multiple of the fewest */
     double step;            /* of the quantiser, a first guess */
-    double mean_square;     /* promised mean squared error, above 0 */
+    /* Without a promise the step stays as it is. */
+    double mean_square;     /* promised mean squared error; 0 for none */
+    double size;            /* promised bytes of all tiles; 0 for none */
 } fhash_plan_task;
 
 typedef struct fhash_plan_result {

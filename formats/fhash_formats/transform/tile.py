@@ -394,25 +394,6 @@ def forward(values: Values, settings: TileSettings) -> Values:
     return result
 
 
-def foretell(
-    coefficients: Values, settings: TileSettings, scale: float, weight: float
-) -> tuple[float, float]:
-    """The bytes that the fast coder would take for coefficients, and the sum of squared errors.
-
-    Args:
-        coefficients: float32 (t, z, y, x).
-        settings: settings of the tile.
-        scale: 1 / quantiser step.
-        weight: squared steps that a bit is worth.
-
-    Returns bytes, and the error in squared steps.
-    """
-    results = (ctypes.c_double * 2)()
-    tile = _tile_of(coefficients, settings)
-    _call("fhash_tile_foretell", tile, _pointer(coefficients), scale, weight, results)
-    return results[0], results[1]
-
-
 def predicted_size(integers: Integers, counted: Mask | None, predictor: Predictor) -> int:
     """The bytes that integers of a tile (t, z, y, x) take where a predictor codes them.
 

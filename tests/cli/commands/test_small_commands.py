@@ -7,7 +7,6 @@ import os
 import platform
 import subprocess
 import sys
-from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -233,7 +232,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     monkeypatch.setattr(cost, "probe_paper", lambda *_: training)
     foretold = SimpleNamespace(predict=lambda config: prediction)
-    monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(foretold))
+    monkeypatch.setattr(cost, "Predictor", lambda series: foretold)
     monkeypatch.setattr(pictures.PictureCosts, "measure", lambda *_: None)
     monkeypatch.setattr(files, "plot", lambda report, path: path.write_bytes(b"PNG"))
 

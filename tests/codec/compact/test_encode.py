@@ -20,7 +20,7 @@ from rarely import rarely
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec.compact import attempt as access
-from fhash_codec.compact import encode
+from fhash_codec.compact import encode, planner
 from fhash_codec.compact.encode import (
     SIZE_PASSES,
     ByteWindow,
@@ -33,11 +33,12 @@ from fhash_codec.compact.encode import (
 )
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.head_training import Budget, Pair, Shape, train_head
-from fhash_codec.compact.plan import CodingPlan
-from fhash_codec.compact.planner import block_of, column_of, plan_by_prices, sheet_of
-from fhash_codec.compact.stages import first_settings
+from fhash_codec.compact.plan import CodingPlan, first_settings
+from fhash_codec.compact.planner import block_of, column_of, sheet_of
 from fhash_codec.compact.tiles import Coding, Outcome, recoded
 from fhash_codec.compact.transform import usual_transform
+from fhash_codec.compact.trials import plan_by_prices
+from fhash_codec.config import ACCESSES
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
@@ -449,11 +450,11 @@ def test_where_no_step_fits_the_best_table_below_is_taken() -> None:
 @pytest.mark.parametrize(
     ("options", "keys"),
     [
-        ({"effort": 2}, {"price", "best", "tried", "region_ms"}),
-        ({"effort": 2, "timings": False}, {"price", "best", "tried"}),
-        ({"effort": 1}, {"price", "best", "tried", "coder"}),
+        ({"effort": 2}, {"price", "tried", "region_ms"}),
+        ({"effort": 2, "timings": False}, {"price", "tried"}),
+        ({"effort": 1}, {"price", "tried"}),
         ({"effort": 2, "tile": "4x8x12x8"}, {"region_ms"}),
-        ({"effort": 1, "access": "fast", "timings": False}, {"price", "best", "tried", "coder"}),
+        ({"effort": 1, "access": "fast", "timings": False}, {"price", "tried"}),
         ({"effort": 2, "tile": "whole", "timings": False}, set()),
     ],
 )
@@ -469,12 +470,11 @@ def test_a_header_says_what_the_tiles_cost(
     fhash_codec.encode(field(shape), tmp_path / "a.fhz", EncodeConfig(**options))
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         record = volume.info["model"].get("tiling", {})
-        assert record.keys() == keys
-        assert "tiling" not in volume.info["model"] or keys
+        assert record.keys() - {"coder"} == keys
+        assert record.get("coder", "fast") == "fast"
     if "price" in record:
-        assert 1 <= record["price"] <= 1.1
-        assert (record["tried"] > 1) == (options["effort"] > 1)
-        assert all(1 <= n <= m for n, m in zip(record["best"], shape, strict=True))
+        assert 1 <= record["price"] <= access.PRICES[options.get("access", "balanced")]
+        assert record["tried"] >= 1
     if "region_ms" in record:
         assert record["region_ms"] > 0
 
@@ -529,7 +529,7 @@ def test_a_plan_does_not_depend_on_the_threads(kind: str) -> None:
     assert plans[0] == plans[1] == plans[2]
 
 
-@pytest.mark.parametrize("psnr", [40.0, 60.0])
+@pytest.mark.parametrize("psnr", [50.0, 60.0])
 def test_one_or_two_codings_come_near_the_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, psnr: float
 ) -> None:
@@ -541,3 +541,65 @@ def test_one_or_two_codings_come_near_the_promise(
     assert len(coded) <= 2
     assert psnr <= psnr_of(values, decoded(tmp_path / "a.fhz")) < psnr + 0.15
     assert figures["psnr"] == pytest.approx(psnr_of(values, decoded(tmp_path / "a.fhz")), 1e-6)
+
+
+def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a series of a million vertices a large one."""
+    for module in (access, planner):
+        monkeypatch.setattr(module, "MAX_WHOLE_VERTICES", 1 << 19)
+    monkeypatch.setattr(access, "MAX_VERTICES", 1 << 18)
+    monkeypatch.setattr(planner, "WINDOW_VERTICES", 1 << 19)
+    monkeypatch.setattr(planner, "LEAST_EDGE", 16)
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_a_large_series_has_long_tiles_where_steps_are_alike(
+    monkeypatch: pytest.MonkeyPatch, *, in_memory: bool
+) -> None:
+    """Few steps alone would look at the still noise anew."""
+    small_limits(monkeypatch)
+    if not in_memory:
+        monkeypatch.setattr("fhash_codec.compact.tiles.MAX_BYTES_IN_MEMORY", 1)
+    shape = (64, 32, 32, 32)
+    still = np.random.default_rng(5).normal(size=shape[1:])
+    moving = 0.02 * np.random.default_rng(6).normal(size=shape)
+    with ThreadPoolExecutor(2) as workers:
+        task = plan_task((still + moving).astype(np.float32), workers, psnr=25.0)
+        attempt = plan_by_prices(task, first_settings(task, task.blocks.retile((8, 32, 32, 32))))
+    assert attempt.tiling is not None
+    assert attempt.tiling.tile[0] > 16
+    assert np.prod(attempt.tiling.tile) <= 1 << 18
+
+
+def test_faster_wishes_have_faster_regions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
+    works = []
+    for wish in ACCESSES:
+        with ThreadPoolExecutor(2) as workers:
+            task = plan_task(waves((8, 16, 48, 48)), workers, psnr=40.0, access=wish)
+            attempt = plan_by_prices(task, first_settings(task, task.blocks))
+        assert attempt.tiling is not None
+        assert attempt.tiling.price is not None
+        assert attempt.tiling.price <= access.PRICES[wish]
+        works.append(access.region_vertices(task.blocks.shape, attempt.tiling.tile))
+    assert works == sorted(works)
+
+
+@pytest.mark.parametrize("around", ["noise", "the same waves"])
+def test_vertices_that_do_not_count_are_filled_where_that_pays(tmp_path: Path, around: str) -> None:
+    values = waves((8, 16, 56, 56))
+    mask = np.zeros(values.shape, bool)
+    mask[:, 3:11, 8:40, 5:45] = True
+    if around == "noise":
+        noise = np.random.default_rng(0).normal(size=values.shape)
+        values = np.where(mask, values, noise).astype(np.float32)
+    sizes = {}
+    for without in ((), ("filling",)):
+        path = tmp_path / "a.fhz"
+        config = EncodeConfig(psnr=50.0, effort=4, dilation=0, without=without)
+        sizes[without] = fhash_codec.encode(values, path, config, mask=mask, force=True)["bytes"]
+        with fhash_codec.open(path) as volume:
+            error = (volume[...] - values)[mask].astype(np.float64)
+        data_range = float(np.ptp(values))
+        assert 20 * np.log10(data_range / np.sqrt(np.mean(error**2))) >= 50.0
+    assert sizes[()] <= 1.02 * sizes["filling",]

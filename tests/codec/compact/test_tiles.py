@@ -31,14 +31,13 @@ from fhash_codec.compact.attempt import (
     FAST_ENOUGH,
     MAX_WHOLE_VERTICES,
     PRICES,
-    cheap_tiling,
     even_tile,
     parse_tile,
     region_vertices,
     tiles_to_try,
 )
 from fhash_codec.compact.model import CompactModel, PlainArray, head_of
-from fhash_codec.compact.sample import PricedSample, Sample, fill, priced, strata
+from fhash_codec.compact.sample import Sample, fill, strata
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
@@ -51,13 +50,12 @@ from fhash_codec.compact.tiles import (
     TileRun,
     code,
 )
-from fhash_codec.compact.transform import CODED, choose_transform, usual_transform
+from fhash_codec.compact.transform import usual_transform
 from fhash_codec.config import ACCESSES
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.container import Container
 from fhash_formats.series import ArraySeries, StepsSeries
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.tile_format import TileSettings
 
@@ -120,29 +118,6 @@ def test_boxes_are_parts_one_after_the_other(
         assert last.counted is not None
         assert not last.counted[1:].any()
         assert halves.weight((2 * number + 1, 0, 0, 1)) == [2, 1, 5][number]
-
-
-@pytest.mark.parametrize("in_memory", [True, False])
-@pytest.mark.parametrize("features", [("all",), ("interval:0:10",)])
-def test_a_window_is_the_part_where_values_vary_most(
-    monkeypatch: pytest.MonkeyPatch, in_memory: bool, features: tuple[str, ...]
-) -> None:
-    if not in_memory:
-        monkeypatch.setattr("fhash_codec.compact.tiles.MAX_BYTES_IN_MEMORY", 1)
-    monkeypatch.setattr(f"{__name__}.VALUES", VALUES.copy())
-    VALUES[:, :, :, :4] *= 0.01
-    blocks = blocks_of((5, 3, 7, 4), features)
-    window = blocks.window((3, 6, 7, 4))
-    assert window.shape == window.tile == (3, 6, 7, 4)
-    assert window.in_memory
-    part = window.read((0, 0, 0, 0))
-    np.testing.assert_array_equal(part.values, VALUES[1:4, :, :, 4:])
-    whole = blocks.retile(SHAPE).read((0, 0, 0, 0)).counted
-    assert (part.counted is None) == (whole is None) == window.complete
-    if part.counted is not None and whole is not None:
-        np.testing.assert_array_equal(part.counted, whole[1:4, :, :, 4:])
-    half = window.retile((3, 6, 7, 2))
-    np.testing.assert_array_equal(half.read((0, 0, 0, 1)).values, VALUES[1:4, :, :, 6:])
 
 
 @pytest.mark.parametrize("features", [("all",), ("interval:0:1",)])
@@ -397,74 +372,6 @@ SHAPES = [(12, 25, 125, 125), (600, 12, 14, 16), (2, 128, 160, 160), (40, 3, 160
 LONG = [(64, 128, 256, 256), (1, 512, 512, 512), (500, 3, 100, 400)]
 
 
-def waves() -> Blocks:
-    """Two tiles of a sum of waves, with noise."""
-    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (4, 12, 24, 48)), indexing="ij")
-    values = np.sin(0.3 * t + 0.2 * z) * np.cos(0.25 * y - 0.15 * x)
-    values += np.random.default_rng(0).normal(0, 0.004, values.shape)
-    series = ArraySeries(values.astype(np.float32))
-    extent = select_features(series, EncodeConfig(), silent).extent
-    return Blocks(series, extent, (2, 12, 24, 48))
-
-
-WAVES_SETTINGS = TileSettings(
-    transform=usual_transform((2, 12, 24, 48)),
-    step=0.02,
-    center=0.0,
-    low=-1.1,
-    high=1.1,
-    offsets=OFFSETS,
-)
-
-
-@pytest.mark.parametrize("error", [None, 0.01])
-def test_a_price_is_near_the_bytes_and_the_error_of_a_coding(error: float | None) -> None:
-    settings = replace(WAVES_SETTINGS, quantum=0.0199 if error else 0.0)
-    coding = Coding(error=error, fast=True)
-    with ThreadPoolExecutor(1) as pool:
-        sample = Sample(waves(), 1 << 20, pool)
-        coded = sample.run(settings, coding)
-        mixed = sample.run(settings, replace(coding, fast=False))
-        orthonormal = TransformSpec(axes=(AxisTransform(kind="haar", depth=1),) * 4)
-        nothing = replace(settings, transform=orthonormal, step=100.0)
-        foretold, without = PricedSample(sample).run_all([(settings, coding), (nothing, Coding())])
-    assert foretold.size == pytest.approx(coded.size, rel=0.2)
-    assert foretold.count == coded.count
-    if error is None:
-        assert foretold.squares == pytest.approx(mixed.squares, rel=0.15)
-    values = np.stack([tile.values for tile in sample.tiles]).astype(np.float64)
-    assert without.size <= 2 * len(sample.tiles)  # flags of empty bands
-    assert without.squares == pytest.approx(np.sum(values * values), rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("sigma", "bits"), [(0.01, 0.0), (0.25, 0.3125), (1.0, 2.1048), (7.9, 5.0299), (8.1, 5.0650)]
-)
-def test_the_residual_of_normal_errors_takes_their_entropy(sigma: float, bits: float) -> None:
-    """The numbers are those of scipy.stats.norm."""
-    assert 8 * sample_module._residual_bytes(3 * sigma, 3.0) == pytest.approx(bits, abs=2e-4)
-
-
-def test_the_best_of_priced_transforms_are_coded() -> None:
-    runs: list[int] = []
-
-    class Counted(Sample):
-        def run_all(self, trials: Any) -> list[Outcome]:
-            runs.append(len(trials))
-            return super().run_all(trials)
-
-    settings = WAVES_SETTINGS
-    with ThreadPoolExecutor(1) as pool:
-        sample = Counted(waves(), 1 << 20, pool)
-        chosen, price = choose_transform(priced(sample, settings, 5), settings, Coding())
-        assert runs == [CODED]
-        _, best = choose_transform(priced(sample, settings, 6), settings, Coding())
-        assert sum(runs) > 10
-    assert chosen.transform != settings.transform
-    assert best <= price < 1.02 * best
-    assert priced(sample, replace(settings, double=True), 5) is sample
-
-
 @pytest.mark.parametrize("shape", [*SHAPES, *LONG, (1, 1, 1, 1), (3, 5, 7, 1)])
 def test_tiles_are_tried_from_the_fastest_region_to_the_whole(shape: Shape) -> None:
     tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES)
@@ -478,19 +385,6 @@ def test_tiles_are_tried_from_the_fastest_region_to_the_whole(shape: Shape) -> N
     for tile in few:  # and few of their vertices lie beyond the border
         covered = prod(-(-length // n) * n for n, length in zip(tile, shape, strict=True))
         assert covered <= 1.7 * prod(shape)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("size", [1e3, 1e5, 1e7])
-def test_a_wish_for_access_is_never_answered_by_slower_tiles(shape: Shape, size: float) -> None:
-    works = []
-    for access in ACCESSES:
-        tiling = cheap_tiling(shape, size, access)
-        assert tiling.price is not None
-        assert 1 <= tiling.price <= PRICES[access]
-        works.append(region_vertices(shape, tiling.tile))
-    assert works == sorted(works)
-    assert cheap_tiling(shape, size, "small").tile == shape
 
 
 def test_every_wish_has_a_price() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -55,7 +54,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         def predict(self, config: EncodeConfig) -> Prediction:
             return Prediction(seconds=self.seconds, bytes=9, psnr=40.0, basis="")
 
-    monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(Foretold(series)))
+    monkeypatch.setattr(cost, "Predictor", Foretold)
     training = SimpleNamespace(
         of_share=lambda kept: training, stage_seconds=lambda config: {"a": 0.0}
     )

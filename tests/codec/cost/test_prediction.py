@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from math import prod
 from pathlib import Path
@@ -16,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Coding, Outcome, Tile
-from fhash_codec.compact.transform import choose_transform, count_trials
+from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost import encodings as own
 from fhash_codec.cost import prediction as time_budget
+from fhash_codec.cost import probe as probes
 from fhash_codec.cost.encodings import OwnEncodings
 from fhash_codec.cost.peers import EXACT, LADDER, PeerEncodings, Search, Trial
 from fhash_codec.cost.plan import (
@@ -39,14 +36,13 @@ from fhash_codec.cost.plan import (
     wishes,
 )
 from fhash_codec.cost.prediction import (
-    LOOKED_AT,
     MAX_EFFORT,
     MAX_EPOCHS,
     Prediction,
     Predictor,
     choose,
 )
-from fhash_codec.cost.probe import PaperProbe, look_at, probe_rates, updates_of
+from fhash_codec.cost.probe import CompactProbe, PaperProbe, part_of, promise_of_part
 from fhash_codec.cost.results import (
     DEFAULT,
     NETWORK,
@@ -60,32 +56,30 @@ from fhash_codec.encoding import encode
 from fhash_codec.paper.train import usual_batches
 from fhash_codec.progress import silent
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InterruptedEncodingError, RegionError
-from fhash_formats.series import ArraySeries, Series, StepsSeries
-from fhash_formats.support.threads import thread_pool
-from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.errors import InputError, InterruptedEncodingError, RegionError
+from fhash_formats.series import ArraySeries, Series
 
 SERIES = ArraySeries(np.random.default_rng(0).normal(size=(8, 8, 16, 16)).astype(np.float32))
 
 
-def test_a_part_stands_for_the_whole_series() -> None:
-    config = EncodeConfig(psnr=40.0, effort=1)
-    with thread_pool() as workers:
-        look = look_at(StepsSeries(SERIES, range(4)), 8, config, workers)
-        assert look.share == 0.5
-        assert look.shape == SERIES.shape
-        assert look.task.blocks.shape == (4, 8, 16, 16)
-        rates = probe_rates(look, config)
-    assert abs(rates.outcome.psnr(look.task.goal.data_range) - 40) < 2
-    assert min(rates.trial, rates.search, rates.final, rates.decode, rates.compare) > 0
-    assert rates.fill == rates.predict == rates.fit == 0
+PART = CompactProbe(
+    vertices=1 << 20,
+    stages={"opening": 1.0, "plan": 1.0, "predictor": 1.0, "coding": 1.0},
+    fixed_bytes=100,
+    growing_bytes=1000,
+    psnr=50.0,
+)
 
 
-def test_a_training_of_twice_the_updates_takes_twice_as_long() -> None:
-    once, twice = (updates_of(updates, 0) for updates in (800, 1600))
-    assert 800 < once < 1600
-    assert 1.9 < twice / once < 2.1
-    assert updates_of(800, 400_000) > once
+@pytest.mark.parametrize(
+    ("larger", "plan", "predictor"),
+    [(1, 1.0, 1.0), (2, 2**0.5, 2**0.5), (12, 2**0.5, 12**0.5), (120, 2**0.5, 10 * 12**0.5)],
+)
+def test_each_stage_grows_by_its_work(larger: int, plan: float, predictor: float) -> None:
+    stages = PART.stage_seconds(larger << 20)
+    assert (stages["opening"], stages["coding"]) == (1.0, larger)
+    assert (stages["plan"], stages["predictor"]) == pytest.approx((plan, predictor))
+    assert PART.bytes(larger << 20) == 100 + 1000 * larger
 
 
 PROBE = PaperProbe(
@@ -123,126 +117,206 @@ def test_a_share_of_a_series_has_its_samples_and_steps_of_their_size() -> None:
     assert PROBE.of_share(1.0) == PROBE
 
 
-@pytest.mark.parametrize("shape", [(4, 8, 24, 24), (1, 1, 40, 40), (3, 1, 1, 30), (2, 150, 8, 8)])
-def test_trials_of_a_transform_are_those_that_the_encoder_makes(
-    shape: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    series = ArraySeries(np.random.default_rng(0).normal(size=shape).astype(np.float32))
-    trials, fitted = [], []
-    run_all = Sample.run_all
-
-    def counted(self: Sample, jobs: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
-        trials.append(len(jobs))
-        return run_all(self, jobs)
-
-    with ThreadPoolExecutor(1) as workers:
-        config = EncodeConfig(psnr=40.0, tile="whole")
-        look = look_at(series, shape[0], config, workers)
-        sample = Sample(look.task.blocks, 1 << 20, workers)
-        monkeypatch.setattr(Sample, "run_all", counted)
-        map_all = Sample.map_all
-        monkeypatch.setattr(
-            Sample, "map_all", lambda self, work: (fitted.append(work), map_all(self, work))[1]
-        )
-        coding = replace(look.attempt.coding, fast=False)
-        choose_transform(sample, look.attempt.settings, coding)
-    assert isinstance(sample.tiles[0], Tile)
-    assert (sum(trials), len(fitted)) == count_trials(shape, in_memory=True)
-
-
-def waves(shape: tuple[int, int, int, int] = (6, 8, 24, 24)) -> npt.NDArray[np.float32]:
+def waves(shape: tuple[int, int, int, int] = (12, 4, 16, 16)) -> npt.NDArray[np.float32]:
     t, z, y, x = np.ogrid[tuple(slice(n) for n in shape)]
     return (np.sin(0.3 * x + 0.2 * y + 0.1 * t) * np.cos(0.2 * z)).astype(np.float32)
 
 
-def predicted(values: npt.NDArray[np.generic], *configs: EncodeConfig) -> list[Prediction]:
-    with time_budget.predictor(ArraySeries(values)) as one:
-        return [one.predict(config) for config in configs]
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of a series is encoded where it can be, and not the whole."""
+    monkeypatch.setattr(time_budget, "WHOLE_SECONDS", 0.0)
 
 
 def only(values: npt.NDArray[np.generic], **settings: object) -> Prediction:
-    (prediction,) = predicted(values, EncodeConfig.from_dict(settings))
-    return prediction
+    return Predictor(ArraySeries(values)).predict(EncodeConfig.from_dict(settings))
 
 
-def test_each_setting_has_a_prediction() -> None:
-    configs = [EncodeConfig(psnr=psnr, effort=effort) for psnr in (40.0, 60.0) for effort in (1, 2)]
-    predictions = predicted(waves(), *configs)
-    coarse, _, fine, _ = predictions
-    assert coarse.bytes is not None
-    assert fine.bytes is not None
-    assert 0 < coarse.bytes < fine.bytes
-    assert fine.psnr is not None
-    assert fine.psnr >= 60
-    for prediction in predictions:
-        assert prediction.seconds == pytest.approx(sum(prediction.stages.values()))
-        assert prediction.basis
+def made(values: npt.NDArray[np.generic], folder: Path, **settings: object) -> EncodeReport:
+    return encode(ArraySeries(values), folder / "made.fhz", EncodeConfig.from_dict(settings))
 
 
-@pytest.mark.parametrize("effort", [4, 5, 6])
-def test_each_effort_has_a_prediction(effort: int) -> None:
-    """Efforts code alike up to 6, but heads are looked at from 5 on."""
-    noisy = waves() + np.random.default_rng(0).normal(0, 0.05, (6, 8, 24, 24)).astype(np.float32)
-    assert ("head trial" in only(noisy, psnr=40.0, effort=effort).stages) == (effort >= 5)
+def encoded_by(cost: Callable[[int, int], Mapping[str, float]]) -> Callable[..., Any]:
+    """An encoder that counts its work as seconds: by vertices and effort, of each stage."""
+
+    def encode(series: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
+        vertices = prod(series.shape)
+        stages = [
+            {"stage": name, "seconds": seconds, "times": 1}
+            for name, seconds in cost(vertices, config.effort).items()
+        ]
+        size = vertices // 50
+        return {
+            "stages": stages,
+            "bytes": size + 500,
+            "split": {"field": size, "model": 100, "index": 400},
+            "psnr": 50.0,
+            "rmse": 0.1,
+        }, True
+
+    return encode
 
 
-def test_only_what_an_effort_does_is_counted() -> None:
-    values = waves() + np.random.default_rng(0).normal(0, 0.05, (6, 8, 24, 24)).astype(np.float32)
-    stages = {effort: only(values, effort=effort, psnr=50.0).stages for effort in (1, 2, 6)}
-    assert {"estimate", "coding", "measuring"} <= set(stages[1])
-    assert "transform" not in stages[1]
-    assert stages[2]["transform"] > 0
-    assert "head trial" not in stages[2]
-    assert stages[6]["head trial"] > 0
-    without = only(values, effort=6, psnr=50.0, without=["transform", "head"]).stages
-    assert without["bases"] == 0 < stages[6]["bases"]
-    assert "head trial" not in without
+def counted(vertices: int, effort: int) -> dict[str, float]:
+    """Work of an encoder, in seconds, that plans up to 2 million vertices and codes all."""
+    planned, searched = min(vertices, 2_000_000), min(vertices, 12_000_000)
+    stages = {"scan": 1e-8 * vertices, "plan": effort * (0.05 + 2e-7 * planned)}
+    if effort >= 5:
+        stages["head"] = 0.5 + 2e-7 * searched
+    return {**stages, "coding": 1e-7 * effort * vertices}
 
 
-def test_a_bound_counts_the_predictor_and_exact_labels_themselves() -> None:
-    bound = only(waves(), effort=2, max_error=1e-3)
-    assert bound.stages["predictor"] > 0
-    assert bound.psnr is not None
+@pytest.mark.parametrize("effort", [1, 5])
+@pytest.mark.parametrize("shape", [(16, 8, 48, 48), (64, 16, 64, 64), (400, 16, 64, 64)])
+def test_seconds_are_those_of_the_whole_within_a_factor(
+    shape: tuple[int, int, int, int], effort: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probes, "reported", encoded_by(counted))
+    series = _Long(shape)
+    prediction = Predictor(series).predict(EncodeConfig(effort=effort))
+    true = sum(counted(prod(shape), effort).values())
+    assert true / 2 < prediction.seconds < 2 * true
+    assert prediction.seconds == pytest.approx(sum(prediction.stages.values()))
+    assert prediction.bytes == pytest.approx(prod(shape) / 50 + 500, rel=0.01)
+
+
+@pytest.mark.usefixtures("parts")
+@pytest.mark.parametrize("effort", [1, 3])
+def test_bytes_are_those_of_the_whole_within_30_percent(effort: int, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).normal(0, 0.05, (16, 8, 32, 32)).astype(np.float32)
+    values = waves((16, 8, 32, 32)) + noise
+    prediction = only(values, psnr=45.0, effort=effort)
+    report = made(values, tmp_path, psnr=45.0, effort=effort)
+    assert prediction.bytes == pytest.approx(report["bytes"], rel=0.3)
+    assert prediction.psnr == pytest.approx(45.0, abs=0.5)
+    assert prediction.basis.startswith("an encoding of 4 of 16 steps, in ")
+
+
+PROMISES: list[dict[str, object]] = [
+    {},
+    {"psnr": 40.0, "psnr_bulk": 30.0},
+    {"psnr_bulk": 30.0},
+    {"max_error": 1e-2},
+    {"max_error_rel": 1e-3},
+    {"ratio": 4.0},
+    {"psnr": 45.0, "features": ["interval:0.2:2"]},
+    {"psnr": 45.0, "effort": 5},
+]
+
+
+@pytest.mark.usefixtures("parts")
+@pytest.mark.parametrize("settings", PROMISES)
+def test_every_promise_has_a_prediction(settings: dict[str, object], tmp_path: Path) -> None:
+    values = waves() + np.random.default_rng(0).normal(0, 0.05, (12, 4, 16, 16)).astype(np.float32)
+    prediction = only(values, **{"effort": 2, **settings})
+    report = made(values, tmp_path, **{"effort": 2, **settings})
+    assert prediction.seconds > 0
+    assert prediction.bytes is not None
+    assert report["bytes"] / 2 < prediction.bytes < 2 * report["bytes"]
+    # of so few bytes, the header takes a larger share in the part
+    assert prediction.psnr == pytest.approx(report["psnr"], abs=20 if "ratio" in settings else 3)
+
+
+@pytest.mark.usefixtures("parts")
+def test_exact_labels_have_no_psnr() -> None:
     labels = np.repeat(np.arange(24 * 24).reshape(24, 24) // 96, 48).reshape(6, 8, 24, 24)
     exact = only(labels.astype(np.uint8), max_error=0.0)
     assert exact.psnr is None
     assert exact.stages["labels"] > 0
 
 
-def test_a_coreset_with_a_mask_counts_its_filling() -> None:
-    filled = only(waves(), effort=2, psnr=45.0, features=["interval:0.2:2"])
-    assert filled.stages["filling"] > 0
-    assert "filling" not in only(waves(), effort=2, psnr=45.0).stages
+@pytest.mark.usefixtures("parts")
+def test_a_part_may_err_as_much_as_the_whole() -> None:
+    """The range of the middle steps is a tenth of that of the series."""
+    values = waves()
+    values[0] *= 10
+    series = ArraySeries(values)
+    part = part_of(series, 0.25)
+    for asked, moved in (
+        (EncodeConfig(psnr=60.0), EncodeConfig(psnr=40.0)),
+        (EncodeConfig(max_error_rel=1e-3), EncodeConfig(max_error_rel=1e-2)),
+        (EncodeConfig(max_error=1e-3), EncodeConfig(max_error=1e-3)),
+        (EncodeConfig(), EncodeConfig()),
+    ):
+        found = promise_of_part(asked, part, series)
+        for name in ("psnr", "max_error", "max_error_rel"):
+            expected = getattr(moved, name)
+            assert getattr(found, name) == (expected and pytest.approx(expected, rel=0.1))
+        assert promise_of_part(asked, series, series) == asked
+
+
+@pytest.mark.usefixtures("parts")
+def test_what_no_part_has_is_predicted_by_the_whole() -> None:
+    values = waves()
+    values[0, 0, 0, 0] = 9.0
+    prediction = only(values, effort=1, psnr=30.0, features=["interval:5:10"])
+    assert prediction.basis.startswith("an encoding of the whole series")
+    with pytest.raises(InputError, match="interval:50:60"):
+        only(values, effort=1, features=["interval:50:60"])
+
+
+def test_a_series_that_takes_no_time_is_encoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time_budget, "WHOLE_SECONDS", 1e9)
+    prediction = only(waves(), effort=2, psnr=40.0)
+    report = made(waves(), tmp_path, effort=2, psnr=40.0)
+    # the header has timings in it
+    assert prediction.bytes == pytest.approx(report["bytes"], abs=100)
+    assert prediction.basis.startswith("an encoding of the whole series")
+
+
+@pytest.mark.usefixtures("parts")
+def test_each_setting_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder, asked = encoded_by(counted), []
+
+    def noted(series: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
+        asked.append(config.effort)
+        result: tuple[dict[str, Any], bool] = encoder(series, path, config)
+        return result
+
+    monkeypatch.setattr(probes, "reported", noted)
+    one = Predictor(ArraySeries(waves()))
+    for effort in (1, 3, 1, 3):
+        one.predict(EncodeConfig(effort=effort))
+    assert asked == [1, 3]
 
 
 class _Long(Series):
-    """A series of many large frames, which counts those that are read."""
+    """A series of many frames, which counts those that are read."""
 
-    def __init__(self) -> None:
-        like = ArraySeries(np.zeros((4096, 1, 1, 1), np.float32))
+    def __init__(self, shape: tuple[int, int, int, int]) -> None:
+        steps, *space = shape
+        like = ArraySeries(np.zeros((steps, 1, 1, 1), np.float32))
         self.source, self.name, self.units, self.attributes = "long", "v", "", {}
-        self.dtype, self.shape = np.dtype(np.float32), (4096, 4, 64, 64)
+        self.dtype, self.shape = np.dtype(np.float32), shape
         self.coords = {
-            **ArraySeries(np.zeros((1, 4, 64, 64), np.float32)).coords,
+            **ArraySeries(np.zeros((1, *space), np.float32)).coords,
             "t": like.coords["t"],
         }
         self.seen: set[int] = set()
 
     def read(self, step: int) -> npt.NDArray[np.float32]:
         self.seen.add(step)
-        z, y, x = np.ogrid[:4, :64, :64]
+        z, y, x = np.ogrid[tuple(slice(n) for n in self.shape[1:])]
         return np.asarray(np.sin(0.1 * (x + y + z) + 0.01 * step), dtype=np.float32)
 
 
 def test_of_a_long_series_a_part_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fhash_codec.cost.prediction.LOOKED_AT", 1 << 18)
-    assert LOOKED_AT < 4096 * 4 * 64 * 64
-    series = _Long()
-    with thread_pool() as workers:
-        prediction = Predictor(series, workers).predict(EncodeConfig(effort=1, psnr=40.0))
+    monkeypatch.setattr(probes, "PLANNED_VERTICES", 1 << 18)
+    series = _Long((4096, 4, 64, 64))
+    prediction = Predictor(series).predict(EncodeConfig(effort=1))
     assert series.seen == {step for first in (1022, 3066) for step in range(first, first + 8)}
     assert prediction.bytes is not None
-    assert "0% of the steps" in prediction.basis
+    assert "16 of 4096 steps" in prediction.basis
+
+
+def test_of_large_frames_a_crop_is_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "PLANNED_VERTICES", 1 << 14)
+    series = _Long((64, 4, 128, 128))
+    prediction = Predictor(series).predict(EncodeConfig(effort=1, psnr=40.0))
+    assert "8 of 64 steps cropped in space" in prediction.basis
+    assert prod(part_of(series, 0.25).shape) <= 1.3 * (1 << 14)
 
 
 SERIES_PREDICTION = ArraySeries(np.zeros((1, 2, 2, 2), np.float32))
@@ -260,11 +334,7 @@ class _Known:
 
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    @contextmanager
-    def predictor(_: Any) -> Iterator[_Known]:
-        yield _Known()
-
-    monkeypatch.setattr(time_budget, "predictor", predictor)
+    monkeypatch.setattr(time_budget, "Predictor", lambda series: _Known())
 
 
 @pytest.mark.parametrize(
@@ -280,6 +350,16 @@ def test_the_highest_effort_that_fits_is_chosen(seconds: float, effort: int, fit
     assert "\n" not in choice.why
     if effort < MAX_EFFORT and fits:
         assert f"--effort {effort + 1} would take" in choice.why
+
+
+def test_more_time_allows_no_less_effort(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "reported", encoded_by(counted))
+    series = _Long((64, 16, 64, 64))
+    choices = [choose(series, EncodeConfig(), seconds) for seconds in (0.01, 5, 10, 60, 600)]
+    efforts = [choice.config.effort for choice in choices]
+    assert efforts == sorted(efforts)
+    assert (efforts[0], efforts[-1]) == (1, MAX_EFFORT)
+    assert [choice.fits for choice in choices] == [False, True, True, True, True]
 
 
 @pytest.mark.usefixtures("known")

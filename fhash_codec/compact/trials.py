@@ -1,0 +1,512 @@
+"""Plan of a series: what prices tell, and what is measured on a few coded parts.
+
+These tell the coder, the error that a trellis and a bulk leave, the step of a bound or of a size,
+and whether vertices that do not count are filled.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from math import prod
+
+import numpy as np
+
+from fhash_codec.compact.attempt import (
+    FAST_BYTES,
+    Attempt,
+    PlanTask,
+    Tiling,
+    decoding_ns,
+    sub_tile,
+)
+from fhash_codec.compact.goal import (
+    EXCHANGE,
+    SLOPE,
+    Goal,
+    find_step,
+    step_after,
+    with_step,
+)
+from fhash_codec.compact.head import LEAST_GAIN, choose_head, training_pairs
+from fhash_codec.compact.head_training import foretold_gain
+from fhash_codec.compact.masks import with_mask
+from fhash_codec.compact.planner import block_of, by_prices, in_part, part_costs
+from fhash_codec.compact.predictor import choose_predictor
+from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.tiles import (
+    MIN_STEP_SHARE,
+    Blocks,
+    Coding,
+    Outcome,
+    off_trellis,
+    on_trellis,
+)
+from fhash_codec.compact.transform import (
+    NONE,
+    Bases,
+    in_plane,
+    magnitudes_of,
+    magnitudes_of_all,
+    moved_transform,
+    refit,
+    squared_error,
+    weighted,
+)
+from fhash_codec.progress import skip, stage, tell
+from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.tile_format import TileSettings
+
+CODED_PART = 1 << 18
+"""Vertices of a part that is coded."""
+CODED_VERTICES = 1 << 19
+"""Vertices of all parts that are coded: a single one foretold a wrong coder."""
+LOOKS = 3
+"""Times that parts are coded for the step at most."""
+FARTHEST = 3.0
+"""Factor by which the step changes at most from one look to the next."""
+NEAR = 0.35
+"""Change of the logarithm of the step, 2 dB, up to which no further look is needed."""
+AIM = 0.02
+"""dB above the promise that the step is for: all tiles are coded again where they fall short."""
+ROUNDING_ERROR = 12**-0.5
+"""Root of the mean squared error of rounding to integers, in data units."""
+
+
+def is_nearly_exact(task: PlanTask) -> bool:
+    """Whether a PSNR leaves integers less error than rounding, so that exact ones may be smaller.
+
+    Below the error of that rounding, hardly any step of the quantiser gives the PSNR: a little
+    finer, and all values are exact.
+    """
+    return (
+        task.goal.psnr is not None
+        and task.blocks.dtype.kind in "iu"
+        and task.goal.expected_error < ROUNDING_ERROR
+    )
+
+
+MIN_EFFORT = 2
+"""Least effort that uses the trellis."""
+
+
+def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
+    """Whether the trellis may be used.
+
+    Values that are exact after all have no use for it. Steps so fine that they need float64 come
+    near the finest step there is, with which the plain quantiser errs less.
+    """
+    exact = goal.error == 0 or goal.data_range <= 0
+    return effort >= MIN_EFFORT and not exact and not settings.double
+
+
+def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
+    """Return the plan of a series, with the step that should keep the promise.
+
+    Where vertices do not count, one plan keeps the values that are there, and another fills them:
+    that of the fewer bytes is taken.
+
+    settings: with a first guess of the step.
+    """
+    task.parts.begin("tiles and transform")
+    view = in_part(task.blocks)
+    attempt = _planned(task, view, settings, 0)
+    if not task.blocks.complete and task.asks("filling"):
+        task.parts.begin("fill values")
+        attempt = _with_filling(task, view, attempt)
+    return attempt
+
+
+def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int) -> Attempt:
+    """Return a plan by prices, with the coder and the step by coded parts.
+
+    view: the series, or parts of it.
+    settings: with a guess of the step.
+    density: thoroughness of filling vertices that do not count; 0 keeps what is there.
+    """
+    goal, config = task.goal, task.config
+    with stage("plan", "tiles, transform and step, by prices of some parts"):
+        settings, found = by_prices(task, view, settings, density)
+    tiling = None
+    if task.fixed_tile is None:
+        tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
+        tell("plan", f"--access {config.access}: {tiling.describe()}")
+    tiled = view.retile(found.tile)
+    coding = Coding(
+        filled=density == 0,
+        density=density,
+        bulk=goal.bulk,
+        passes=2 if config.effort > 2 else 1,
+        rounds=2 if config.effort < 7 else 4,
+    )
+    with stage("step", "coder and step, by coding some parts"):
+        parts = coded_parts(task, tiled, settings.step)
+        attempt = _coded(task, settings, coding, tiled, parts, found.size)
+    task.gains.note("transform by trial", attempt.outcome)
+    return replace(attempt, tiling=tiling)
+
+
+COMPARED_VERTICES = 5 << 18
+"""Vertices of the block on which plans are compared: of half as many, bases are not worth it."""
+TRIAL_DENSITY = 2
+"""Thoroughness of filling there: more of it changed no choice."""
+CLEARLY = 0.99
+"""Share of the bytes below which another transform is taken there."""
+
+
+def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
+    """Return the plan that keeps the values where none count, or one that fills them.
+
+    Both code the same block, since prices of parts of different tiles do not compare.
+    """
+    filled = _planned(task, view, present.settings, task.density)
+    shape = block_of(view.shape, COMPARED_VERTICES)
+    cut = view.retile(shape)
+    costs = part_costs(task, cut, present.settings.step)
+    assert costs is not None
+    index = list(cut.indices())[int(np.argmax(costs))]
+    t, z, y, x = (number * n for number, n in zip(index, shape, strict=True))
+    block = view.boxes(shape, [(t, z, y, x)], [1])
+    filled, size = _tried_filled(task, view, block, filled)
+    kept = _size_of(task, block, present)
+    tell("filling", f"a block takes {kept:.0f} bytes as it is, {size:.0f} filled")
+    return present if kept <= size else filled
+
+
+def _size_of(task: PlanTask, block: Blocks, attempt: Attempt) -> float:
+    """Return the bytes that a block takes by a plan where the promise is kept."""
+    sample = Sample(block.retile(attempt.sample.blocks.tile), 1 << 62, task.workers)
+    settings, coding = moved_transform(sample, attempt.settings), task.goal.bounded(attempt.coding)
+    outcome = sample.run(settings, coding)
+    if task.goal.psnr is not None:
+        step = step_after(settings, outcome, task.goal)
+        outcome = sample.run(replace(settings, step=step), coding)
+    return _at_promise(outcome, task.goal)
+
+
+def _tried_filled(
+    task: PlanTask, view: Blocks, block: Blocks, attempt: Attempt
+) -> tuple[Attempt, float]:
+    """Return a plan that fills vertices with the best transform, and the bytes of a block.
+
+    No price tells it, since a filling suits the transform that it was made for: here it goes on for
+    each.
+    """
+    tile = attempt.sample.blocks.tile
+    bases = Bases(Sample(view.retile(tile), 1, task.workers), attempt.settings)
+    t, z, y, x = attempt.settings.transform.axes
+    plane = in_plane("9/7", 3, tile)
+    trials = [(t, z, y, x), (NONE, z, y, x), (NONE, NONE, plane[2], plane[3])]
+    if bases.possible(*tile[1:]):
+        trials.append((t, bases.along(1), bases.along(2), bases.along(3)))
+    sample = Sample(block.retile(tile), 1 << 62, task.workers)
+    sample = sample.filled(moved_transform(sample, attempt.settings), TRIAL_DENSITY)
+    coding = task.goal.bounded(replace(attempt.coding, density=0))
+    best, least = attempt, math.inf
+    for axes in dict.fromkeys(trials):
+        settings = replace(attempt.settings, transform=TransformSpec(axes=axes))
+        outcome = sample.run(moved_transform(sample, settings), coding)
+        size = _at_promise(outcome, task.goal)
+        if size < (CLEARLY if best is attempt else 1.0) * least:
+            step = step_after(settings, outcome, task.goal)
+            best, least = replace(attempt, settings=with_step(settings, step, task.goal)), size
+    return best, least
+
+
+def coded_parts(task: PlanTask, tiled: Blocks, step: float) -> Sample:
+    """Return the parts of the tiles that are coded."""
+    blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
+    costs = part_costs(task, blocks, step)
+    return Sample(blocks, CODED_VERTICES, task.workers, costs, task.parts.tick)
+
+
+def with_fill(coding: Coding) -> Coding:
+    """Return the coding of tiles that are filled already."""
+    return replace(coding, filled=True, density=0)
+
+
+def _coded(
+    task: PlanTask,
+    settings: TileSettings,
+    coding: Coding,
+    tiled: Blocks,
+    parts: Sample,
+    size: float,
+) -> Attempt:
+    """Return the plan with the better coder, at the step that should keep the promise.
+
+    settings: of the plain quantiser.
+    parts: coded for the choice.
+    size: bytes of all tiles by price.
+    """
+    goal, sample = task.goal, Sample(tiled, 1, task.workers)
+    settings = with_mask(task, parts, settings, goal.expected_error)
+    moved = moved_transform(parts, settings)
+    parts = parts.filled(moved, coding.density)
+    if allows_trellis(settings, goal, task.config.effort):
+        settings, coding = on_trellis(settings, coding)
+        moved, _ = on_trellis(moved, coding)
+    outcome = parts.run(moved, goal.bounded(with_fill(coding)))
+    if task.is_slow(tiled.tile, size):
+        faster = replace(coding, fast=True)
+        other = parts.run(moved, goal.bounded(with_fill(faster)))
+        ratio = _at_promise(other, goal) / max(_at_promise(outcome, goal), 1.0)
+        most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
+        tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
+        if ratio <= most:
+            coding, outcome = faster, other
+    if goal.data_range <= 0:
+        pass  # any step gives the one value that there is
+    elif goal.psnr is not None:
+        settings, moved, outcome = _promised_step(
+            task, settings, moved, tiled, parts, outcome, coding
+        )
+    else:
+        moved, outcome = find_step(parts, moved, with_fill(coding), goal, tries=3)
+        settings = replace(moved, transform=settings.transform)
+        if outcome.count:
+            error = math.sqrt(outcome.squares / outcome.count)
+            settings = with_mask(task, parts, settings, error)
+    return Attempt(
+        sample=sample,
+        settings=refit(sample, settings),
+        outcome=outcome,
+        coding=coding,
+        parts=parts,
+        moved=moved,
+    )
+
+
+def _promised_step(
+    task: PlanTask,
+    settings: TileSettings,
+    moved: TileSettings,
+    tiled: Blocks,
+    parts: Sample,
+    outcome: Outcome,
+    coding: Coding,
+) -> tuple[TileSettings, TileSettings, Outcome]:
+    """Return settings of a step that should give the promised PSNR, of tiles and of parts.
+
+    The outcome is what is expected of all tiles.
+
+    moved: settings of the parts.
+    outcome: of the parts, with these.
+    """
+    goal = task.goal
+    assert goal.psnr is not None
+    for _ in range(LOOKS):
+        step = _step(task, settings, moved, tiled, parts, outcome)
+        change = min(max(step / settings.step, 1 / FARTHEST), FARTHEST)
+        if abs(math.log(change)) < NEAR:
+            break
+        # So far from where it was measured, coefficients foretell the error badly.
+        settings = with_step(settings, change * settings.step, goal)
+        moved = moved_transform(parts, replace(moved, step=settings.step, double=settings.double))
+        outcome = parts.run(moved, with_fill(coding))
+    else:
+        step = _step(task, settings, moved, tiled, parts, outcome)
+    octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
+    expected = Outcome(
+        size=round(outcome.size * 2**-octaves),
+        squares=squared_error(parts.counted, goal.psnr, goal.data_range),
+        count=parts.counted,
+        max_error=outcome.max_error,
+    )
+    return with_step(settings, step, goal), moved, expected
+
+
+def _at_promise(outcome: Outcome, goal: Goal) -> float:
+    """Return the bytes at a promised PSNR, by the usual exchange rate of dB for bytes."""
+    missing = 0.0 if goal.psnr is None else goal.psnr - outcome.psnr(goal.data_range)
+    return outcome.size * 2 ** (missing / EXCHANGE) if math.isfinite(missing) else outcome.size
+
+
+PEER_NS = (44.0, 58.0)
+"""Nanoseconds in which a vertex may be decoded, and more for each of its bits: twice SPERR's."""
+
+
+def most_by_fast_coder(bits: float, access: str) -> float:
+    """Return the bytes that the fast coder may take, as a multiple of those of the other one.
+
+    They grow from 1 on with the time by which the other one is slower than is wished for.
+
+    bits: of a vertex.
+    """
+    most = FAST_BYTES[access]
+    if most < 1 or access != "balanced":
+        return most
+    late = decoding_ns(bits, "mixing") / (PEER_NS[0] + PEER_NS[1] * bits)
+    return min(max(1 + 2 * (most - 1) * (late - 1), 1.0), most)
+
+
+def _step(
+    task: PlanTask,
+    settings: TileSettings,
+    moved: TileSettings,
+    tiled: Blocks,
+    parts: Sample,
+    outcome: Outcome,
+) -> float:
+    """Return the step at which all tiles should have the promised error, by their coefficients.
+
+    What coefficients foretell is corrected by the true error of coded parts. Where vertices do not
+    count, and tiles may be filled, the parts stand for all tiles.
+
+    moved: settings of these parts.
+    outcome: of the parts.
+    """
+    goal = task.goal
+    assert goal.psnr is not None
+    few = weighted([magnitudes_of(tile.values, moved) for tile in parts.tiles], parts.weights)
+    series, count = few, parts.counted
+    if tiled.complete:
+        series = magnitudes_of_all(tiled, settings, task.workers)
+        count = sum(tiled.weights) * prod(tiled.shape)
+    foretold = few.error(settings.step)
+    least = goal.data_range * MIN_STEP_SHARE
+    if not (foretold > 0 and outcome.squares > 0):
+        even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range)
+        return series.step(even, least)
+    error = squared_error(count, goal.psnr + AIM, goal.data_range)
+    step = series.step(error * foretold / outcome.squares, least)
+    if outcome.bulk_squares == 0:
+        return step
+    error *= outcome.bulk_count / max(outcome.count, 1)
+    return min(step, series.step(error * foretold / outcome.bulk_squares, least))
+
+
+SEARCHED = 12 << 20
+"""Vertices up to which all tiles of a series are coded to compare what few parts do not tell."""
+SAMPLED = 6 << 20
+"""Vertices of the tiles of a larger series that stand for all."""
+
+
+def on_all_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return a plan whose outcome is that of all tiles, or of many where a series is large."""
+    if attempt.tried:
+        return attempt
+    sample, coding = tiles_of(task, attempt), attempt.coding
+    outcome = sample.run(attempt.settings, task.goal.bounded(with_fill(coding)))
+    return replace(attempt, sample=sample, outcome=outcome, tried=[outcome])
+
+
+def tiles_of(task: PlanTask, attempt: Attempt) -> Sample:
+    """Return all tiles of a plan, or many where a series is large, filled as they are coded."""
+    blocks = task.blocks.retile(attempt.sample.blocks.tile)
+    most = SEARCHED if prod(blocks.shape) <= SEARCHED else SAMPLED
+    costs = part_costs(task, blocks, attempt.settings.step)
+    sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
+    return sample.filled(attempt.settings, attempt.coding.density)
+
+
+MIN_HEAD_EFFORT = 5
+"""Least effort that trains a head."""
+
+
+def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the plan with a head where coded parts say that one pays."""
+    if not task.asks("head"):
+        return attempt
+    if reason := _without_head(task, attempt):
+        skip("head", reason)
+        return attempt
+    assert attempt.parts is not None
+    assert attempt.moved is not None
+    with stage("head trial", "gain of least squares on some parts"):
+        coding = task.goal.bounded(with_fill(attempt.coding))
+        pairs = training_pairs(attempt.parts, attempt.moved, coding)
+        low, high = attempt.settings.low, attempt.settings.high
+        gain = foretold_gain(pairs, low, high, task.config.seed)
+    # Who wishes for the fewest bytes pays the seconds of a training for little.
+    if gain < (0 if task.config.access == "small" else LEAST_GAIN):
+        skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
+        return attempt
+    task.parts.begin("head")
+    attempt = on_all_tiles(task, attempt)
+    coding = with_fill(attempt.coding)
+
+    def find(settings: TileSettings) -> tuple[TileSettings, Outcome]:
+        if task.goal.error is None:
+            return find_step(attempt.sample, settings, coding, task.goal, tries=3)
+        assert attempt.parts is not None
+        assert attempt.moved is not None
+        # All tiles keep a bound at any step: parts tell which costs least.
+        of_parts = replace(settings, transform=attempt.moved.transform)
+        found, _ = find_step(attempt.parts, of_parts, coding, task.goal, tries=3)
+        settings = replace(found, transform=settings.transform)
+        return settings, look(settings)
+
+    def look(settings: TileSettings) -> Outcome:
+        return attempt.sample.run(settings, task.goal.bounded(coding))
+
+    settings, outcome, history = choose_head(
+        task, replace(attempt, coding=coding), gain, find, look
+    )
+    if settings.head is None:
+        settings, outcome = find(settings)
+    task.gains.note("head" if settings.head is not None else "head (left out)", outcome)
+    return replace(attempt, settings=settings, outcome=outcome, history=history)
+
+
+def _without_head(task: PlanTask, attempt: Attempt) -> str:
+    """Return why no head is to be trained; "" where one is."""
+    goal, effort = task.goal, task.config.effort
+    if effort < MIN_HEAD_EFFORT:
+        return f"effort {effort} trains none; from {MIN_HEAD_EFFORT} on"
+    if goal.size is not None:
+        return "a promised ratio: the step changes once the whole file is known"
+    if goal.error == 0 or goal.data_range <= 0:
+        return "exact values leave nothing to correct"
+    if attempt.settings.double:
+        return "the step is too fine for float32, in which heads compute"
+    return ""
+
+
+WITH_HEAD = 0.6
+"""Share of the bytes by the transform that no head takes fewer than."""
+
+
+def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the plan with a head, or with a predictor under a strict bound, if that is smaller."""
+    predicted = _predicted(task, attempt)
+    if predicted is None:
+        return with_head(task, attempt)
+    attempt = on_all_tiles(task, attempt)
+    size = predicted.outcome.size
+    if size >= WITH_HEAD * attempt.outcome.size:
+        attempt = with_head(task, attempt)
+    else:
+        skip("head", "predicted values take fewer bytes than it would leave")
+    # What is predicted is read slowly: no reason to give up the fast coder for little.
+    share = FAST_BYTES[task.config.access] if attempt.coding.fast else 1.0
+    kept = size * share < attempt.outcome.size
+    task.gains.note("prediction" if kept else "prediction (left out)", predicted.outcome)
+    return predicted if kept else attempt
+
+
+def _predicted(task: PlanTask, attempt: Attempt) -> Attempt | None:
+    """Return the plan of all tiles with a predictor where some parts take fewer bytes by it."""
+    goal, effort = task.goal, task.config.effort
+    if not goal.error or goal.data_range <= 0:
+        skip("predictor", "only a bound on each error has use for it")
+        return None
+    if effort == 1 or not task.asks("predictor"):
+        return None
+    assert attempt.parts is not None
+    with stage("predictor", "trials beside the transform, for the bound on each error"):
+        settings = choose_predictor(
+            attempt.sample,
+            attempt.parts,
+            attempt.settings,
+            attempt.outcome.size,
+            error=goal.error,
+            effort=effort,
+        )
+    if settings is None:
+        return None
+    if settings.trellis:
+        settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients now
+    sample, coding = tiles_of(task, attempt), goal.bounded(with_fill(attempt.coding))
+    outcome = sample.run(settings, coding)
+    return replace(attempt, sample=sample, settings=settings, outcome=outcome, tried=[outcome])
