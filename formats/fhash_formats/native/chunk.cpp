@@ -1,23 +1,37 @@
-// Encoding of a tile to a stated quality: the search for a transform and a quantisation step.
+// Encoding of a tile to a stated quality. The planner finds its transform by prices (planner.cpp);
+// trials on some of its parts find the step that takes the fewest bytes under a bound, and whether
+// a predictor takes fewer.
 #include <cfloat>
 #include <cstdlib>
 
 #include "core.hpp"
 #include "encode.hpp"
 #include "numbers.hpp"
+#include "planner.hpp"
 
 namespace fhash {
 namespace {
 
 constexpr double WEIGHT = 0.09, TRELLIS_WEIGHT = 0.27;  // squared steps that a bit is worth
 constexpr int8_t TRELLIS_OFFSETS[OFFSET_COUNT] = {17, -10, -5, -3, -2, -1};
-constexpr int MAX_DEPTHS[4] = {1, 1, 5, 5};  // of a 9/7 transform along t, z, y, x
 constexpr int MAX_EFFORT = 9, MAX_LABELS = 65536, FEW_LABELS = 256;
 constexpr double REGION_SHARE = 0.5;  // of vertices with an equal neighbour: labels may be many
 constexpr double FIRST_RATIO = 2.5;   // step under a bound, in units of half the quantum
 constexpr double OTHER_RATIOS[] = {4.0, 1.6};
+constexpr double CLOSE = 1.15;  // bytes beside those of a predictor that other steps may save
+// Orders in which a predictor refines the axes, the best predicted one last, and how often it does.
+constexpr int ORDERS[2][4] = {{0, 1, 2, 3}, {3, 2, 1, 0}};
+constexpr int64_t REFINED[2][4] = {{2, 3, 3, 3}, {0, 3, 3, 3}};
+constexpr double MAX_FORETOLD = 1 << 26;  // half the range in steps: predicted integers are small
+constexpr double MAX_WHOLE = 0x1p40;      // bound on integers whose steps are exact
 constexpr int CLEARLY = 4;  // ratio of a deflated tile to its labels: nothing else is tried
-constexpr int64_t MAX_WINDOW = 1 << 16;       // values on which settings are tried at effort 2
+constexpr int64_t PRICED = 1 << 18, TRIED = 1 << 17;  // values on which effort 2 does so
+constexpr int64_t IN_COLUMN = 1 << 16, IN_BLOCK = 1 << 15;  // values of one part of them
+constexpr int LINE = 3, PLANE = 12;   // axes t and z, axes y and x, a bit each
+constexpr int64_t ROWS = 4;           // distance in y of the rows that a part's cost is taken from
+constexpr double LEAST_COST = 0.05;   // share of the mean cost that each part has at least
+constexpr int64_t MAX_LINES = 2048;   // that a basis is fitted to
+constexpr int64_t BASIS_WORK = 8;     // of finding a basis of n vectors: n^3 times this
 constexpr int32_t MAX_MISSING = 16;  // that a caller names; with others, at most MAX_MARKED
 constexpr size_t FAR_VALUES = 4;  // _FillValue, missing_value and two flags, at either end
 constexpr double QUANTUM_SHARE = 1 - 1e-6;    // of twice the largest error, for its rounding
@@ -25,83 +39,85 @@ constexpr double MAX_STEPS = 2.5e8;           // largest coefficient, as estimat
 constexpr double MAX_VALUE = 1e300, MIN_STEP = 1e-290;
 constexpr double MAX_SINGLE = 1e30, MIN_SINGLE = 1e-30;  // for arithmetic in float32
 
-struct Spec {
-    uint8_t axes[4];  // kind times 16, plus depth
+void put_number(Buffer& out, uint64_t bits) {
+    for (int byte = 0; byte < 8; byte++) out.push_back((uint8_t)(bits >> 8 * byte));
+}
 
-    bool operator==(const Spec& other) const { return std::equal(axes, axes + 4, other.axes); }
+void put_block(Buffer& out, const Buffer& block) {
+    put_leb(out, block.size());
+    out.insert(out.end(), block.begin(), block.end());
+}
+
+void put_real(Buffer& out, double number) {
+    uint64_t bits;
+    std::memcpy(&bits, &number, sizeof bits);
+    put_number(out, bits);
+}
+
+// A transform, or a predictor in its place.
+struct Form {
+    uint8_t axes[4];              // kind times 16, plus depth
+    std::array<Buffer, 4> bases;  // packed, of the axes that have one of their own
+    const int* order = nullptr;   // of a predictor; null for a transform
+    const int64_t* levels = nullptr;
 };
-
-int bit_length(int64_t n) {
-    int bits = 0;
-    for (; n; n >>= 1) bits++;
-    return bits;
-}
-
-// The transforms to try, each once: 9/7 along all axes; then Haar, and then none, along the first
-// axis longer than 1, which often is time; then Haar along all axes.
-std::vector<Spec> candidates(const Shape& shape) {
-    size_t first = 0;
-    while (first < 4 && shape[first] == 1) first++;
-    if (first == 4) return {Spec{{0, 0, 0, 0}}};
-    int depths[4];
-    for (size_t a = 0; a < 4; a++)
-        depths[a] = shape[a] < 2
-                        ? 0
-                        : std::max(1, std::min(MAX_DEPTHS[a], bit_length(shape[a]) - 3));
-    if (std::min(shape[2], shape[3]) >= 16) depths[2] = depths[3] = std::min(depths[2], depths[3]);
-    // Few tiles are long in time: there, two levels of Haar are worth it.
-    const int haar = first < 2 ? std::min(2, bit_length(shape[first]) - 1) : depths[first];
-    std::vector<Spec> specs;
-    const auto add = [&](int kind, int first_kind, int first_depth) {
-        Spec spec;
-        for (size_t a = 0; a < 4; a++)
-            spec.axes[a] = (uint8_t)(depths[a] ? kind << 4 | depths[a] : 0);
-        spec.axes[first] = (uint8_t)(first_kind << 4 | first_depth);
-        if (std::find(specs.begin(), specs.end(), spec) == specs.end()) specs.push_back(spec);
-    };
-    add(DAUBECHIES_KIND, DAUBECHIES_KIND, depths[first]);
-    add(DAUBECHIES_KIND, HAAR_KIND, haar);
-    add(DAUBECHIES_KIND, NONE_KIND, 0);
-    add(HAAR_KIND, HAAR_KIND, haar);
-    return specs;
-}
 
 // The numbers of settings that a search changes.
 struct Draft {
-    Spec spec;
+    Form form;
     double step, center, low, high, quantum;
     bool real64, clip, trellis;
     Wide origin;
     int64_t whole_low, whole_high;  // ends of the range about an origin
 
-    std::shared_ptr<const Settings> settings(fhash_context& context, fhash_error& error) const {
+    std::shared_ptr<const Settings> settings(fhash_context& context, const Shape& shape,
+                                             fhash_error& error) const {
         Buffer packed;
-        const bool whole = !origin.zero();
+        const bool whole = !origin.zero(), predicts = form.order != nullptr;
         packed.push_back((uint8_t)((real64 ? 1 : 0) | (clip ? 2 : 0) | (trellis ? 8 : 0) |
-                                   (whole ? 16 : 0)));
-        packed.insert(packed.end(), spec.axes, spec.axes + 4);
-        const auto put = [&](uint64_t bits) {
-            for (int byte = 0; byte < 8; byte++) packed.push_back((uint8_t)(bits >> 8 * byte));
-        };
-        const auto put_real = [&](double number) {
-            uint64_t bits;
-            std::memcpy(&bits, &number, sizeof bits);
-            put(bits);
-        };
-        for (const double number : {step, quantum, center}) put_real(number);
+                                   (whole ? 16 : 0) | (predicts ? 128 : 0)));
+        packed.insert(packed.end(), form.axes, form.axes + 4);
+        for (const double number : {step, quantum, center}) put_real(packed, number);
         if (!whole)
-            for (const double end : {low, high}) put_real(end);
+            for (const double end : {low, high}) put_real(packed, end);
         if (whole) {
-            put((uint64_t)whole_low);
-            put((uint64_t)whole_high);
-            put(origin.bits);
+            put_number(packed, (uint64_t)whole_low);
+            put_number(packed, (uint64_t)whole_high);
+            put_number(packed, origin.bits);
             packed.push_back(origin.negative ? 255 : 0);
         }
         const int8_t* const offsets = trellis ? TRELLIS_OFFSETS : PLAIN_OFFSETS;
         const int8_t none[OFFSET_COUNT] = {0};
         const int8_t* const shifts = clip ? offsets : none;
         packed.insert(packed.end(), (const uint8_t*)shifts, (const uint8_t*)shifts + OFFSET_COUNT);
+        for (const Buffer& basis : form.bases)
+            if (!basis.empty()) put_block(packed, basis);
+        if (predicts && !put_predictor(shape, packed, error)) return nullptr;
         return unpack_settings(context, packed.data(), packed.size(), error);
+    }
+
+    // A predictor by the mean of the two neighbours along the axis of a pass: weights that were
+    // learned would take as long as coding the tile, and more bytes where fronts are sharp.
+    bool put_predictor(const Shape& shape, Buffer& packed, fhash_error& error) const {
+        Predictor predictor;
+        put_real(packed, step);
+        put_real(packed, center);
+        int order = 0;
+        for (size_t a = 0; a < 4; a++) {
+            int64_t& level = predictor.levels[a] = 0;
+            while (level < form.levels[a] && 1 << level < shape[a]) level++;
+            packed.push_back((uint8_t)level);
+            order |= form.order[a] << 2 * a;
+        }
+        packed.push_back((uint8_t)order);
+        packed.push_back(0);
+        make_passes(predictor, form.order, 0);
+        const Shape taps = {1, 1, 1, (int64_t)predictor.taps.size() / 5};
+        std::vector<int32_t> weights((size_t)taps[3], 0);
+        Buffer block;
+        if (!encode_integers(weights, taps, single_band(taps), {}, block, error)) return false;
+        put_block(packed, block);
+        return true;
     }
 };
 
@@ -123,6 +139,9 @@ struct Task {
     int64_t size() const { return vertices(shape); }
     bool whole() const { return type < FHASH_FLOAT16; }
     size_t bytes() const { return (size_t)size() * fhash_type_size(type); }
+    bool counts(int64_t vertex) const {
+        return marks.of.empty() || marks.of[(size_t)vertex] == 0;
+    }
     bool lossless() const {
         return error >= 0 && error < (whole() ? 1.0 : 4.9406564584124654e-324);
     }
@@ -167,7 +186,7 @@ template <class O> std::vector<O> far_values(const Task& task, const O* values) 
     const auto less = [](const O& a, const O& b) { return value_of(a) < value_of(b); };
     const auto more = [](const O& a, const O& b) { return value_of(a) > value_of(b); };
     for (int64_t i = 0; i < task.size(); i++) {
-        if (!task.marks.of.empty() && task.marks.of[(size_t)i]) continue;
+        if (!task.counts(i)) continue;
         take(ends[0], values[i], less);
         take(ends[1], values[i], more);
     }
@@ -257,19 +276,20 @@ template <class O> void set_origin(Task& task, O low, O high) {
     }
 }
 
+// A value less the origin.
+template <class O> double number_of(const Task& task, const O& value) {
+    if constexpr (is_real<O>) return real(value);
+    else return task.origin.zero() ? real(value)
+                                   : (double)(int64_t)((uint64_t)value - task.origin.bits);
+}
+
 // The range that a relative bound is of: without 0, which stores put where nothing was written.
 template <class O> void set_ends(Task& task, const O* values) {
-    const auto number = [&](const O& value) {
-        if constexpr (is_real<O>) return real(value);
-        else return task.origin.zero() ? real(value)
-                                       : (double)(int64_t)((uint64_t)value - task.origin.bits);
-    };
     bool any = false;
     task.ends[0] = task.ends[1] = 0;
     for (int64_t i = 0; i < task.size(); i++) {
-        if (value_of(values[i]) == 0 || (!task.marks.of.empty() && task.marks.of[(size_t)i]))
-            continue;
-        const double value = number(values[i]);
+        if (value_of(values[i]) == 0 || !task.counts(i)) continue;
+        const double value = number_of(task, values[i]);
         if (!any || value < task.ends[0]) task.ends[0] = value;
         if (!any || value > task.ends[1]) task.ends[1] = value;
         any = true;
@@ -282,7 +302,7 @@ template <class O> bool survey(Task& task, const O* values) {
     O low{}, high{};
     task.signed_zero = false;
     for (int64_t i = 0; i < task.size(); i++) {
-        if (!task.marks.of.empty() && task.marks.of[(size_t)i]) continue;
+        if (!task.counts(i)) continue;
         if constexpr (is_real<O>) task.signed_zero |= std::signbit(real(values[i]));
         if (!any || value_of(values[i]) < value_of(low)) low = values[i];
         if (!any || value_of(values[i]) > value_of(high)) high = values[i];
@@ -321,83 +341,303 @@ void set_bound(Task& task) {
     task.reach = task.error - task.largest() * epsilon;
 }
 
-// Settings and options of the encoder, and what they made of a window.
-struct Trial {
-    Draft draft;
-    fhash_coding coding;
-    Coded coded;
-    bool whole = false;  // the window was the tile
+// A block of a tile, and for how many blocks it stands.
+struct Part {
+    Shape first;
+    double cost, weight;
+};
+struct Parts {
+    Shape shape;
+    std::vector<Part> all;
+};
 
-    bool run(const Task& task, const uint8_t* values, const Marks& marks, const Shape& shape,
-             fhash_error& error) {
-        const auto settings = draft.settings(task.context, error);
-        whole = shape == task.shape;
-        return settings && encode_tile(task.context, settings, shape, task.type, values, nullptr,
-                                       marks, coding, coded, error);
+// A shape of at most `most` values, if the longest of some axes may be halved down to `least`.
+// axes: these, a bit each.
+Shape shortened(Shape shape, int64_t most, int axes, int64_t least) {
+    while (vertices(shape) > most) {
+        int64_t* longest = nullptr;
+        for (size_t a = 0; a < 4; a++)
+            if (axes >> a & 1 && (!longest || shape[a] > *longest)) longest = &shape[a];
+        if (!longest || *longest <= least) break;
+        *longest = (*longest + 1) / 2;
+    }
+    return shape;
+}
+
+template <class Work>
+void each_row(const Shape& of, const Shape& first, const Shape& shape, Work work) {
+    for (int64_t t = first[0]; t < first[0] + shape[0]; t++)
+        for (int64_t z = first[1]; z < first[1] + shape[1]; z++)
+            for (int64_t y = first[2]; y < first[2] + shape[2]; y++)
+                work(((t * of[1] + z) * of[2] + y) * of[3] + first[3]);
+}
+
+// Some of the parts of a tile: those of about the same cost are a group, of which the one in the
+// middle stands for all. All groups cost the same, so that a costly part stands for few.
+std::vector<Part> strata(std::vector<Part> all, size_t most) {
+    std::sort(all.begin(), all.end(),
+              [](const Part& a, const Part& b) { return a.cost < b.cost; });
+    double total = 0, so_far = 0;
+    for (const Part& part : all) total += part.cost;
+    const double least = total > 0 ? LEAST_COST * total / (double)all.size() : 1.0;
+    total += least * (double)all.size();
+    std::vector<Part> chosen;
+    size_t group = 0;
+    for (size_t first = 0, i = 0; i < all.size(); i++) {
+        so_far += all[i].cost + least;
+        const bool last = i + 1 == all.size();
+        const double next = last ? 0 : so_far + all[i + 1].cost + least;
+        const auto number = (size_t)(next / total * (double)most * (1 - 1e-12));
+        if (!last && number == group) continue;
+        chosen.push_back(all[(first + i + 1) / 2]);
+        chosen.back().weight = (double)(i + 1 - first);
+        group = number;
+        first = i + 1;
+    }
+    return chosen;
+}
+
+// The values of a tile about its centre in steps, and choices of its parts.
+struct Scaled {
+    const Task& task;
+    std::vector<float> values;
+
+    Scaled(const Task& of, double step) : task(of) {
+        with_type(task.type, [&](auto value) {
+            const auto* const all = (const decltype(value)*)(const void*)task.values;
+            values.reserve((size_t)task.size());
+            for (int64_t i = 0; i < task.size(); i++) {
+                const double number = task.counts(i) ? number_of(task, all[i]) : task.center();
+                values.push_back((float)((number - task.center()) / step));
+            }
+            return true;
+        });
+    }
+
+    // The approximate bits of a part, by the differences of neighbours along x.
+    double cost(const Shape& first, const Shape& shape) const {
+        double bits = 0;
+        int64_t row = 0;
+        each_row(task.shape, first, shape, [&](int64_t at) {
+            if (row++ % ROWS) return;
+            for (int64_t i = at + 1; i < at + shape[3]; i++)
+                bits += std::log2(1 + std::fabs(values[(size_t)i] - values[(size_t)i - 1]));
+        });
+        return bits;
+    }
+
+    // Parts of a shape, of at most so many values together, but at least one.
+    Parts parts(const Shape& shape, int64_t most) const {
+        Parts parts = {shape, {}};
+        Shape counts;
+        for (size_t a = 0; a < 4; a++) counts[a] = (task.shape[a] + shape[a] - 1) / shape[a];
+        const bool one = vertices(counts) == 1;
+        for (int64_t number = 0; number < vertices(counts); number++) {
+            Part part = {{}, 0, 1};
+            int64_t rest = number;
+            for (size_t a = 4; a-- > 0; rest /= counts[a])
+                part.first[a] = std::min(rest % counts[a] * shape[a], task.shape[a] - shape[a]);
+            if (!one) part.cost = cost(part.first, shape);
+            parts.all.push_back(part);
+        }
+        const size_t few = (size_t)std::max<int64_t>(1, most / vertices(shape));
+        parts.all = strata(std::move(parts.all), few);
+        return parts;
+    }
+
+    // Lines along an axis, spread evenly.
+    std::vector<float> lines(size_t axis, int64_t& count) const {
+        const int64_t length = task.shape[axis], others = task.size() / length;
+        int64_t stride = 1;
+        for (size_t a = axis + 1; a < 4; a++) stride *= task.shape[a];
+        count = std::min(MAX_LINES, others);
+        std::vector<float> found;
+        for (int64_t line = 0; line < count; line++) {
+            const int64_t number = line * others / count;
+            const int64_t at = number / stride * stride * length + number % stride;
+            for (int64_t i = 0; i < length; i++) found.push_back(values[(size_t)(at + i * stride)]);
+        }
+        return found;
     }
 };
 
-// A block of at most `most` values from the middle of a tile, and their marks.
-Buffer window_of(const Task& task, int64_t most, Shape& lengths, Marks& marks) {
-    lengths = task.shape;
-    while (vertices(lengths) > most) {
-        auto longest = std::max_element(lengths.begin(), lengths.end());
-        *longest = (*longest + 1) / 2;
+// Parts as the planner takes them.
+struct Given {
+    std::vector<float> values;
+    std::vector<uint8_t> counted;
+    std::vector<double> weights;
+
+    fhash_plan_parts of(const Scaled& scaled, const Parts& parts) {
+        const Task& task = scaled.task;
+        double total = 0;
+        for (const Part& part : parts.all) total += part.weight * (double)vertices(parts.shape);
+        for (const Part& part : parts.all) {
+            each_row(task.shape, part.first, parts.shape, [&](int64_t at) {
+                const auto from = scaled.values.begin() + at;
+                values.insert(values.end(), from, from + parts.shape[3]);
+                for (int64_t i = at; i < at + parts.shape[3] && !task.marks.of.empty(); i++)
+                    counted.push_back(task.counts(i));
+            });
+            weights.push_back(part.weight * (double)task.size() / total);
+        }
+        fhash_plan_parts given = {};
+        std::copy_n(parts.shape.begin(), 4, given.shape);
+        given.count = (int64_t)parts.all.size();
+        given.values = values.data();
+        given.counted = counted.empty() ? nullptr : counted.data();
+        given.weights = weights.data();
+        return given;
     }
-    const size_t width = fhash_type_size(task.type);
-    int64_t start[4];
-    for (size_t a = 0; a < 4; a++) start[a] = (task.shape[a] - lengths[a]) / 2;
-    Buffer window;
-    marks.values = task.marks.values;
-    for (int64_t t = 0; t < lengths[0]; t++)
-        for (int64_t z = 0; z < lengths[1]; z++)
-            for (int64_t y = 0; y < lengths[2]; y++) {
-                const int64_t row = ((start[0] + t) * task.shape[1] + start[1] + z) *
-                                        task.shape[2] + start[2] + y;
-                const int64_t first = row * task.shape[3] + start[3];
-                const uint8_t* const from = task.values + (size_t)first * width;
-                window.insert(window.end(), from, from + (size_t)lengths[3] * width);
-                if (task.marks.of.empty()) continue;
-                const uint16_t* const of = task.marks.of.data() + first;
-                marks.of.insert(marks.of.end(), of, of + lengths[3]);
-            }
-    return window;
+};
+
+// The transform of the lowest price. It has no bases of long axes, which take more time than the
+// coding of the tile.
+bool plan(const Scaled& scaled, int64_t most, bool bases, Form& form, fhash_error& error) {
+    const Task& task = scaled.task;
+    fhash_plan_task asked = {};
+    Given columns, sheets;
+    std::vector<float> lines[4];
+    std::copy_n(task.shape.begin(), 4, asked.shape);
+    std::copy_n(task.shape.begin(), 4, asked.columns.shape);
+    if (task.size() <= most) {
+        asked.columns = columns.of(scaled, scaled.parts(task.shape, most));
+    } else if (most > 0) {
+        const int64_t each = most / PRICED * IN_COLUMN;
+        const Shape column = shortened(shortened(task.shape, each, PLANE, 8), 2 * each, LINE, 8);
+        const Shape sheet = shortened(shortened(task.shape, each, LINE, 2), each, PLANE, 8);
+        asked.columns = columns.of(scaled, scaled.parts(column, most));
+        asked.sheets = sheets.of(scaled, scaled.parts(sheet, most));
+    }
+    for (size_t a = 0; a < 4; a++) {
+        const int64_t n = task.shape[a];
+        if (!bases || n < 2 || BASIS_WORK * n * n * n > task.size()) continue;
+        lines[a] = scaled.lines(a, asked.line_counts[a]);
+        asked.lines[a] = lines[a].data();
+    }
+    asked.tiles = task.shape.data();
+    asked.tile_count = 1;
+    asked.step = 1;
+    fhash_plan_result found = {};
+    if (!plan_tile(task.context, asked, found, form.bases, error)) return false;
+    for (size_t a = 0; a < 4; a++)
+        form.axes[a] = task.shape[a] < 2 ? 0 : (uint8_t)(found.kinds[a] << 4 | found.depths[a]);
+    return true;
 }
 
-// The trial of the transform, then the step, then the quantiser that takes the fewest bytes.
-bool best_trial(const Task& task, const std::vector<Spec>& specs, int64_t most, Trial& best,
-                fhash_error& error) {
-    const bool bounded = task.error >= 0;
-    if (specs.size() == 1 && !bounded) return true;
-    Shape lengths;
-    Marks marks;
-    const Buffer window = window_of(task, most, lengths, marks);
-    const auto take_better = [&](Trial trial, bool first) {
-        if (!trial.run(task, window.data(), marks, lengths, error)) return false;
-        if (first || trial.coded.data.size() < best.coded.data.size()) best = std::move(trial);
+// Parts of a tile to code.
+struct Windows {
+    Shape shape;
+    std::vector<Buffer> values;
+    std::vector<Marks> marks;
+    std::vector<double> weights;
+
+    Windows(const Task& task, const Parts& parts) : shape(parts.shape) {
+        const size_t width = fhash_type_size(task.type);
+        for (const Part& part : parts.all) {
+            Buffer window;
+            Marks there = {task.marks.values, {}};
+            each_row(task.shape, part.first, shape, [&](int64_t at) {
+                const uint8_t* const from = task.values + (size_t)at * width;
+                window.insert(window.end(), from, from + (size_t)shape[3] * width);
+                if (task.marks.of.empty()) return;
+                const auto of = task.marks.of.begin() + at;
+                there.of.insert(there.of.end(), of, of + shape[3]);
+            });
+            values.push_back(std::move(window));
+            marks.push_back(std::move(there));
+            weights.push_back(part.weight);
+        }
+    }
+};
+
+// Settings and options of the encoder, and what they made of a tile or its parts.
+struct Trial {
+    Draft draft;
+    fhash_coding coding;
+    double bytes = 0;
+    Coded coded;         // of the tile
+    bool whole = false;  // it is coded
+
+    bool run(const Task& task, fhash_error& error) {
+        whole = true;
+        const auto settings = draft.settings(task.context, task.shape, error);
+        return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
+                                       nullptr, task.marks, coding, coded, error);
+    }
+    bool run(const Task& task, const Windows& windows, fhash_error& error) {
+        if (windows.shape == task.shape) {
+            if (!run(task, error)) return false;
+            bytes = (double)coded.data.size();
+            return true;
+        }
+        const auto settings = draft.settings(task.context, task.shape, error);
+        if (!settings) return false;
+        bytes = (double)settings->packed.size();
+        fhash_coding others = coding;
+        others.own_settings = 0;  // a part has the settings of its tile
+        for (size_t i = 0; i < windows.values.size(); i++) {
+            Coded window;
+            if (!encode_tile(task.context, settings, windows.shape, task.type,
+                             windows.values[i].data(), nullptr, windows.marks[i], others, window,
+                             error))
+                return false;
+            bytes += windows.weights[i] * (double)window.data.size();
+        }
+        return true;
+    }
+};
+
+// The draft of a predictor for the same bound.
+Draft predicted(const Task& task, Draft draft, const int* order, const int64_t* levels) {
+    draft.form = {};
+    draft.form.order = order;
+    draft.form.levels = levels;
+    draft.clip = draft.trellis = false;
+    draft.step = 2 * task.reach * QUANTUM_SHARE;
+    if (task.whole() && task.reach < MAX_WHOLE) {  // integers at such a distance keep it exactly
+        draft.step = 2 * task.reach;
+        draft.center = std::nearbyint(draft.center);
+    }
+    return draft;
+}
+
+// The trial that takes the fewest bytes under a bound: of predictors, then of the transform, whose
+// step and quantiser have to compete with a residual that no price knows.
+bool best_trial(const Task& task, const Windows& windows, Trial& best, fhash_error& error) {
+    const Trial begin = best;
+    const auto tried = [&](const Draft& draft, double weight) {
+        Trial trial = begin;
+        trial.draft = draft;
+        trial.coding.weight = weight;
+        if (!trial.run(task, windows, error)) return false;
+        if (best.bytes == 0 || trial.bytes < best.bytes) best = std::move(trial);
         return true;
     };
-    const Trial begin = best;
-    for (size_t i = 0; i < specs.size(); i++) {
-        Trial trial = begin;
-        trial.draft.spec = specs[i];
-        if (!take_better(std::move(trial), i == 0)) return false;
+    if (!task.quality.transform_given && task.half_range() / (2 * task.reach) < MAX_FORETOLD) {
+        for (const int* order : ORDERS)
+            if (!tried(predicted(task, begin.draft, order, REFINED[0]), 0)) return false;
+        const int* const order = best.draft.form.order;
+        if (task.shape[0] > 1 && !tried(predicted(task, begin.draft, order, REFINED[1]), 0))
+            return false;
     }
-    if (!bounded) return true;
-    const Draft chosen = best.draft;
-    for (const double ratio : OTHER_RATIOS) {
-        Trial trial = begin;
-        trial.draft = chosen;
-        trial.draft.step = ratio * task.reach;
-        if (!take_better(std::move(trial), false)) return false;
+    const double rival = best.bytes;
+    Trial other = std::move(best);
+    best = begin;
+    if (!tried(begin.draft, WEIGHT)) return false;
+    if (rival == 0 || best.bytes < CLOSE * rival) {
+        for (const double ratio : OTHER_RATIOS) {
+            Draft draft = begin.draft;
+            draft.step = ratio * task.reach;
+            if (!tried(draft, WEIGHT)) return false;
+        }
+        Draft draft = best.draft;
+        draft.trellis = true;
+        draft.step *= TRELLIS_SHARE;
+        // Steps so fine come near the finest one of the trellis.
+        if (!draft.real64 && !tried(draft, TRELLIS_WEIGHT)) return false;
     }
-    if (best.draft.real64) return true;  // steps so fine come near the finest one of the trellis
-    Trial other = begin;
-    other.draft = best.draft;
-    other.draft.trellis = true;
-    other.draft.step *= TRELLIS_SHARE;
-    other.coding.weight = TRELLIS_WEIGHT;
-    return take_better(std::move(other), false);
+    if (rival > 0 && rival <= best.bytes) best = std::move(other);
+    return true;
 }
 
 // Whether float32 would lose what the step keeps.
@@ -408,30 +648,41 @@ bool needs_real64(const Task& task, double step) {
            (span / step > 1 << 18 || (task.type != FHASH_FLOAT32 && largest / step > 1 << 20));
 }
 
-// The tile coded by transform; false without an error where that cannot be.
-bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, Coded& coded,
-                 fhash_error& error) {
+// The tile coded by transform or predictor; false without an error where that cannot be.
+bool transformed(const Task& task, Coded& coded, fhash_error& error) {
+    const int effort = task.quality.effort;
     const double given = task.quality.step;
     const double step = given > 0 ? given : FIRST_RATIO * task.reach;
     const bool too_fine = task.error >= 0 && task.reach < task.error / 2;
     const bool in_range = step >= MIN_STEP && task.largest() <= MAX_VALUE &&
                           task.half_range() / step < MAX_STEPS;
     if (too_fine || !in_range) return false;
+    const bool real64 = needs_real64(task, step), fixed = task.quality.transform_given;
     Trial trial;
-    trial.draft = {specs[0], step, task.center(), task.low, task.high,
-                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE,
-                   needs_real64(task, step), true, false, task.origin, task.whole_low,
-                   task.whole_high};
+    trial.draft = {{}, step, task.center(), task.low, task.high,
+                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE, real64, true, false,
+                   task.origin, task.whole_low, task.whole_high};
     trial.coding = {WEIGHT, task.error, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
-    if (effort > 1 && !best_trial(task, specs, MAX_WINDOW << 2 * (effort - 2), trial, error))
-        return false;
-    const auto settings = trial.draft.settings(task.context, error);
+    const Scaled scaled(task, step);
+    const int64_t more = effort > 1 ? 1ll << 2 * (effort - 2) : 0;
+    if (fixed) std::copy_n(task.quality.transform, 4, trial.draft.form.axes);
+    else if (!plan(scaled, more * PRICED, !real64, trial.draft.form, error)) return false;
+    if (effort > 1 && task.error >= 0) {
+        int axes = 0;  // a basis is for its whole axis
+        for (size_t a = 0; a < 4; a++) axes |= trial.draft.form.bases[a].empty() << a;
+        const Shape block = task.size() <= more * TRIED
+                                ? task.shape
+                                : shortened(task.shape, more * IN_BLOCK, axes, 1);
+        const Windows windows(task, scaled.parts(block, more * TRIED));
+        if (!best_trial(task, windows, trial, error)) return false;
+    }
+    const auto settings = trial.draft.settings(task.context, task.shape, error);
     if (!settings) return false;
     const Norms norms = norms_of(task.context, settings->axes, task.shape);
     const double gain = *std::max_element(norms.tz.begin(), norms.tz.end()) *
                         *std::max_element(norms.yx.begin(), norms.yx.end());
     if (task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
-    if (!trial.whole && !trial.run(task, task.values, task.marks, task.shape, error)) return false;
+    if (!trial.whole && !trial.run(task, error)) return false;
     coded = std::move(trial.coded);
     return true;
 }
@@ -440,9 +691,9 @@ bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, C
 bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
               fhash_error& error) {
     const int64_t whole = origin.zero() ? 0 : (int64_t)center;
-    const Draft draft = {{{0, 0, 0, 0}}, 1.0, center, center, center, 0, true, false, false, origin,
+    const Draft draft = {{}, 1.0, center, center, center, 0, true, false, false, origin,
                          whole, whole};
-    const auto settings = draft.settings(task.context, error);
+    const auto settings = draft.settings(task.context, task.shape, error);
     const fhash_coding coding = {0, -1, 0, 0, 1, 0, 1, 1, 1, 0};
     const std::vector<uint8_t> nothing((size_t)task.size(), 0);
     return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
@@ -491,8 +742,7 @@ template <class O> bool has_regions(const O* values, const Shape& shape) {
     return (double)equal / (double)n >= REGION_SHARE;
 }
 
-bool encode_task(const Task& task, const std::vector<Spec>& specs, int effort, Coded& coded,
-                 fhash_error& error) {
+bool encode_task(const Task& task, Coded& coded, fhash_error& error) {
     bool done;
     if (!encode_constant(task, coded, done, error)) return false;
     if (done) return true;
@@ -513,7 +763,7 @@ bool encode_task(const Task& task, const std::vector<Spec>& specs, int effort, C
             }
         }
     }
-    const bool has_other = transformed(task, specs, effort, other, error);
+    const bool has_other = transformed(task, other, error);
     if (!has_other && error.status != FHASH_OK) return false;
     const auto small = [&](bool there, const Coded& one) {
         return there && 2 * one.data.size() < task.bytes();
@@ -578,12 +828,7 @@ bool encode_quality(fhash_context& context, const fhash_tile* tile, const void* 
     if (!kept) return exactly(task, coded, error);
     if (!any) return constant(task, 0.0, {}, coded, error);
     set_bound(task);
-    std::vector<Spec> specs = candidates(task.shape);
-    if (quality->transform_given) {
-        specs.resize(1);
-        std::copy_n(quality->transform, 4, specs[0].axes);
-    }
-    return encode_task(task, specs, quality->effort, coded, error);
+    return encode_task(task, coded, error);
 }
 
 }  // namespace fhash

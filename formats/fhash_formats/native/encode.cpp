@@ -17,13 +17,6 @@ constexpr double MAX_PREDICTED = 1 << 27;
 
 using Mask = std::vector<uint8_t>;  // a byte for each vertex; empty where all count
 
-void put_leb(Buffer& out, uint64_t number) {
-    do {
-        out.push_back((uint8_t)((number & 127) | (number > 127 ? 128 : 0)));
-        number >>= 7;
-    } while (number);
-}
-
 // Bytes of values: those of equal weight together, lowest first, deflated.
 bool pack_planes(const void* values, int64_t n, size_t width, Buffer& out, fhash_error& error) {
     Buffer planes((size_t)n * width);
@@ -446,6 +439,13 @@ bool encode_about_origin(Task& task, const uint8_t* in_coreset, Coded& coded, fh
 }
 
 }  // namespace
+
+void put_leb(Buffer& out, uint64_t number) {
+    do {
+        out.push_back((uint8_t)((number & 127) | (number > 127 ? 128 : 0)));
+        number >>= 7;
+    } while (number);
+}
 
 bool encode_predicted(const Predictor& predictor, const Shape& shape, const uint8_t* counted,
                       std::vector<int32_t>& integers, Buffer& out, fhash_error& error) {

@@ -136,6 +136,9 @@ class Planner {
         return true;
     }
 
+    // The basis along an axis of tiles of a length, packed.
+    const Buffer& packed(size_t axis, int64_t length) { return own(axis, length).packed; }
+
   private:
     fhash_context& context_;
     const fhash_plan_task& task_;
@@ -145,6 +148,7 @@ class Planner {
     int64_t priced_ = 0, tried_ = 0;
     struct Own {
         std::shared_ptr<const Basis> basis;
+        Buffer packed;
         double bytes = 0;
     };
     std::map<std::pair<size_t, int64_t>, Modes> modes_;
@@ -241,8 +245,8 @@ class Planner {
         if (found != bases_.end()) return found->second;
         auto modes = modes_.find(key);
         if (modes == modes_.end()) modes = modes_.emplace(key, modes_along(axis, length)).first;
-        Buffer packed;
         Own& made = bases_[key];
+        Buffer& packed = made.packed;
         if (!pack_basis(modes->second, step_, packed, error_)) return none;
         made.basis = read_basis({packed.data(), packed.data() + packed.size()}, error_);
         made.bytes = BASIS_TEXT * (double)packed.size();
@@ -474,7 +478,7 @@ class Planner {
     // Looks for the step that keeps the promise.
     bool settle(const Set& set, const Kinds& kinds, int tries) {
         double slope = SLOPE, before_log = 0, before = 0;
-        for (int i = 0; i < tries; i++) {
+        for (int i = 0; i < tries && task_.mean_square > 0; i++) {
             Price found;
             if (!price(set, set.all, set.shape(), {kinds}, &found)) return false;
             if (found.mean_square() <= 0) return true;
@@ -636,6 +640,16 @@ class Planner {
 };
 
 }  // namespace
+
+bool plan_tile(fhash_context& context, const fhash_plan_task& task, fhash_plan_result& result,
+               std::array<Buffer, 4>& bases, fhash_error& error) {
+    Planner planner(context, task, error);
+    if (!planner.run(result)) return false;
+    for (size_t a = 0; a < 4; a++)
+        if (result.kinds[a] == KLT_KIND) bases[a] = planner.packed(a, result.tile[a]);
+    return error.status == FHASH_OK;
+}
+
 }  // namespace fhash
 
 using namespace fhash;
@@ -644,7 +658,7 @@ using namespace fhash;
 FHASH_KERNEL int32_t fhash_plan(fhash_context* context, const fhash_plan_task* task,
                                 fhash_plan_result* result, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
-        Planner planner(*context, *task, failed);
-        return planner.run(*result) && failed.status == FHASH_OK;
+        std::array<Buffer, 4> bases;
+        return plan_tile(*context, *task, *result, bases, failed);
     });
 }
