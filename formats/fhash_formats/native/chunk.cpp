@@ -18,6 +18,7 @@ constexpr int MAX_EFFORT = 9, MAX_LABELS = 65536, FEW_LABELS = 256;
 constexpr double REGION_SHARE = 0.5;  // of vertices with an equal neighbour: labels may be many
 constexpr double FIRST_RATIO = 2.5;   // step under a bound, in units of half the quantum
 constexpr double OTHER_RATIOS[] = {4.0, 1.6};
+constexpr double FAR = 1.5;     // the same of the usual transform, that another one may save
 constexpr double CLOSE = 1.15;  // bytes beside those of a predictor that other steps may save
 // Orders in which a predictor refines the axes, the best predicted one last, and how often it does.
 constexpr int ORDERS[2][4] = {{0, 1, 2, 3}, {3, 2, 1, 0}};
@@ -25,8 +26,7 @@ constexpr int64_t REFINED[2][4] = {{2, 3, 3, 3}, {0, 3, 3, 3}};
 constexpr double MAX_FORETOLD = 1 << 26;  // half the range in steps: predicted integers are small
 constexpr double MAX_WHOLE = 0x1p40;      // bound on integers whose steps are exact
 constexpr int CLEARLY = 4;  // ratio of a deflated tile to its labels: nothing else is tried
-constexpr int64_t PRICED = 1 << 18, TRIED = 1 << 17;  // values on which effort 2 does so
-constexpr int64_t IN_COLUMN = 1 << 16, IN_BLOCK = 1 << 15;  // values of one part of them
+constexpr int64_t TRIED = 1 << 16, PARTS = 4;  // values and parts for trials at effort 2
 constexpr int LINE = 3, PLANE = 12;   // axes t and z, axes y and x, a bit each
 constexpr int64_t ROWS = 4;           // distance in y of the rows that a part's cost is taken from
 constexpr double LEAST_COST = 0.05;   // share of the mean cost that each part has at least
@@ -397,18 +397,35 @@ std::vector<Part> strata(std::vector<Part> all, size_t most) {
     return chosen;
 }
 
+// A value that is as often exceeded as not. It is that of a plateau, where there is one: of zeros,
+// which are left of it, even a basis makes zeros.
+double typical(const Task& task) {
+    std::vector<double> some;
+    with_type(task.type, [&](auto value) {
+        const auto* const all = (const decltype(value)*)(const void*)task.values;
+        for (int64_t i = 0; i < task.size(); i += 1 + task.size() / TRIED)
+            if (task.counts(i)) some.push_back(number_of(task, all[i]));
+        return true;
+    });
+    if (some.empty()) return task.center();
+    const auto middle = some.begin() + (int64_t)some.size() / 2;
+    std::nth_element(some.begin(), middle, some.end());
+    return *middle;
+}
+
 // The values of a tile about its centre in steps, and choices of its parts.
 struct Scaled {
     const Task& task;
+    const bool real64;
     std::vector<float> values;
 
-    Scaled(const Task& of, double step) : task(of) {
+    Scaled(const Task& of, const Draft& draft) : task(of), real64(draft.real64) {
         with_type(task.type, [&](auto value) {
             const auto* const all = (const decltype(value)*)(const void*)task.values;
             values.reserve((size_t)task.size());
             for (int64_t i = 0; i < task.size(); i++) {
-                const double number = task.counts(i) ? number_of(task, all[i]) : task.center();
-                values.push_back((float)((number - task.center()) / step));
+                const double number = task.counts(i) ? number_of(task, all[i]) : draft.center;
+                values.push_back((float)((number - draft.center) / draft.step));
             }
             return true;
         });
@@ -490,9 +507,9 @@ struct Given {
     }
 };
 
-// The transform of the lowest price. It has no bases of long axes, which take more time than the
+// The transform of the lowest price, or the usual one if no values may be priced. It has no bases of long axes, which take more time than the
 // coding of the tile.
-bool plan(const Scaled& scaled, int64_t most, bool bases, Form& form, fhash_error& error) {
+bool plan(const Scaled& scaled, int64_t most, Form& form, fhash_error& error) {
     const Task& task = scaled.task;
     fhash_plan_task asked = {};
     Given columns, sheets;
@@ -502,7 +519,7 @@ bool plan(const Scaled& scaled, int64_t most, bool bases, Form& form, fhash_erro
     if (task.size() <= most) {
         asked.columns = columns.of(scaled, scaled.parts(task.shape, most));
     } else if (most > 0) {
-        const int64_t each = most / PRICED * IN_COLUMN;
+        const int64_t each = most / PARTS;
         const Shape column = shortened(shortened(task.shape, each, PLANE, 8), 2 * each, LINE, 8);
         const Shape sheet = shortened(shortened(task.shape, each, LINE, 2), each, PLANE, 8);
         asked.columns = columns.of(scaled, scaled.parts(column, most));
@@ -510,7 +527,7 @@ bool plan(const Scaled& scaled, int64_t most, bool bases, Form& form, fhash_erro
     }
     for (size_t a = 0; a < 4; a++) {
         const int64_t n = task.shape[a];
-        if (!bases || n < 2 || BASIS_WORK * n * n * n > task.size()) continue;
+        if (most == 0 || scaled.real64 || n < 2 || BASIS_WORK * n * n * n > task.size()) continue;
         lines[a] = scaled.lines(a, asked.line_counts[a]);
         asked.lines[a] = lines[a].data();
     }
@@ -601,42 +618,93 @@ Draft predicted(const Task& task, Draft draft, const int* order, const int64_t* 
     return draft;
 }
 
-// The trial that takes the fewest bytes under a bound: of predictors, then of the transform, whose
-// step and quantiser have to compete with a residual that no price knows.
-bool best_trial(const Task& task, const Windows& windows, Trial& best, fhash_error& error) {
-    const Trial begin = best;
-    const auto tried = [&](const Draft& draft, double weight) {
+// Trials on parts of a tile under a bound.
+struct Trials {
+    const Scaled& scaled;
+    const int64_t most;
+    const Trial begin;
+    fhash_error& error;
+    Windows windows;
+
+    Trials(const Scaled& of, int64_t values, const Trial& first, fhash_error& failed)
+        : scaled(of), most(values), begin(first), error(failed), windows(cut(first.draft.form)) {}
+
+    // Windows that are as long as the tile where a form has a basis, which is for all of an axis.
+    Windows cut(const Form& form) const {
+        const Task& task = scaled.task;
+        int axes = 0;
+        for (size_t a = 0; a < 4; a++) axes |= form.bases[a].empty() << a;
+        const int64_t each = task.size() <= most ? most : most / PARTS;
+        return {task, scaled.parts(shortened(task.shape, each, axes, 1), most)};
+    }
+
+    bool take(const Draft& draft, double weight, Trial& best) const {
         Trial trial = begin;
         trial.draft = draft;
         trial.coding.weight = weight;
-        if (!trial.run(task, windows, error)) return false;
+        if (!trial.run(scaled.task, windows, error)) return false;
         if (best.bytes == 0 || trial.bytes < best.bytes) best = std::move(trial);
         return true;
-    };
-    if (!task.quality.transform_given && task.half_range() / (2 * task.reach) < MAX_FORETOLD) {
-        for (const int* order : ORDERS)
-            if (!tried(predicted(task, begin.draft, order, REFINED[0]), 0)) return false;
-        const int* const order = best.draft.form.order;
-        if (task.shape[0] > 1 && !tried(predicted(task, begin.draft, order, REFINED[1]), 0))
-            return false;
     }
-    const double rival = best.bytes;
-    Trial other = std::move(best);
-    best = begin;
-    if (!tried(begin.draft, WEIGHT)) return false;
-    if (rival == 0 || best.bytes < CLOSE * rival) {
+
+    // The best of some predictors.
+    bool predict(Trial& best) const {
+        const Task& task = scaled.task;
+        const Draft& draft = begin.draft;
+        for (const int* order : ORDERS)
+            if (!take(predicted(task, draft, order, REFINED[0]), WEIGHT, best)) return false;
+        const int* const order = best.draft.form.order;
+        return task.shape[0] < 2 ||
+               take(predicted(task, draft, order, REFINED[1]), WEIGHT, best);
+    }
+
+    // The transform that is planned, beside the usual one where both fit the windows.
+    bool transform(Trial& best, Trial& foretold) {
+        Draft draft = begin.draft;
+        draft.form = {};
+        if (!plan(scaled, most, draft.form, error)) return false;
+        const Shape before = windows.shape;
+        windows = cut(draft.form);
+        if (windows.shape != before) {
+            best.bytes = 0;
+            if (foretold.bytes > 0 && !foretold.run(scaled.task, windows, error)) return false;
+        }
+        return take(draft, WEIGHT, best);
+    }
+
+    // Other steps and the trellis: a residual that no price knows competes with the step.
+    bool refine(Trial& best) const {
         for (const double ratio : OTHER_RATIOS) {
-            Draft draft = begin.draft;
-            draft.step = ratio * task.reach;
-            if (!tried(draft, WEIGHT)) return false;
+            Draft draft = best.draft;
+            draft.step = ratio * scaled.task.reach;
+            if (!take(draft, WEIGHT, best)) return false;
         }
         Draft draft = best.draft;
         draft.trellis = true;
         draft.step *= TRELLIS_SHARE;
         // Steps so fine come near the finest one of the trellis.
-        if (!draft.real64 && !tried(draft, TRELLIS_WEIGHT)) return false;
+        return draft.real64 || take(draft, TRELLIS_WEIGHT, best);
     }
-    if (rival > 0 && rival <= best.bytes) best = std::move(other);
+};
+
+// The trial that takes the fewest bytes under a bound. `best` has the usual transform, or a given
+// one, which no other may replace.
+bool best_trial(const Scaled& scaled, int64_t most, Trial& best, fhash_error& error) {
+    const Task& task = scaled.task;
+    const bool given = task.quality.transform_given;
+    Trials trials(scaled, most, best, error);
+    Trial foretold = best;
+    if (!given && task.half_range() / (2 * task.reach) < MAX_FORETOLD && !trials.predict(foretold))
+        return false;
+    if (!trials.take(trials.begin.draft, WEIGHT, best)) return false;
+    const auto beats = [&](double factor) {
+        return foretold.bytes > 0 && factor * foretold.bytes <= best.bytes;
+    };
+    if (!beats(FAR)) {
+        if (!given && !trials.transform(best, foretold)) return false;
+        if (!beats(CLOSE) && !trials.refine(best)) return false;
+    }
+    if (beats(1)) best = std::move(foretold);
     return true;
 }
 
@@ -657,31 +725,24 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     const bool in_range = step >= MIN_STEP && task.largest() <= MAX_VALUE &&
                           task.half_range() / step < MAX_STEPS;
     if (too_fine || !in_range) return false;
-    const bool real64 = needs_real64(task, step), fixed = task.quality.transform_given;
     Trial trial;
-    trial.draft = {{}, step, task.center(), task.low, task.high,
-                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE, real64, true, false,
-                   task.origin, task.whole_low, task.whole_high};
+    trial.draft = {{}, step, typical(task), task.low, task.high,
+                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE, needs_real64(task, step),
+                   true, false, task.origin, task.whole_low, task.whole_high};
     trial.coding = {WEIGHT, task.error, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
-    const Scaled scaled(task, step);
-    const int64_t more = effort > 1 ? 1ll << 2 * (effort - 2) : 0;
-    if (fixed) std::copy_n(task.quality.transform, 4, trial.draft.form.axes);
-    else if (!plan(scaled, more * PRICED, !real64, trial.draft.form, error)) return false;
-    if (effort > 1 && task.error >= 0) {
-        int axes = 0;  // a basis is for its whole axis
-        for (size_t a = 0; a < 4; a++) axes |= trial.draft.form.bases[a].empty() << a;
-        const Shape block = task.size() <= more * TRIED
-                                ? task.shape
-                                : shortened(task.shape, more * IN_BLOCK, axes, 1);
-        const Windows windows(task, scaled.parts(block, more * TRIED));
-        if (!best_trial(task, windows, trial, error)) return false;
-    }
+    const Scaled scaled(task, trial.draft);
+    const int64_t most = effort > 1 ? TRIED << 2 * (effort - 2) : 0;
+    Form& form = trial.draft.form;
+    const bool bounded = task.error >= 0, priced = !bounded && !task.quality.transform_given;
+    if (task.quality.transform_given) std::copy_n(task.quality.transform, 4, form.axes);
+    else if (!plan(scaled, priced ? most : 0, form, error)) return false;
+    if (bounded && effort > 1 && !best_trial(scaled, most, trial, error)) return false;
     const auto settings = trial.draft.settings(task.context, task.shape, error);
     if (!settings) return false;
     const Norms norms = norms_of(task.context, settings->axes, task.shape);
     const double gain = *std::max_element(norms.tz.begin(), norms.tz.end()) *
                         *std::max_element(norms.yx.begin(), norms.yx.end());
-    if (task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
+    if (2 * task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
     if (!trial.whole && !trial.run(task, error)) return false;
     coded = std::move(trial.coded);
     return true;
