@@ -5,15 +5,15 @@
 #include <cstdlib>
 
 #include "core.hpp"
-#include "encode.hpp"
+#include "draft.hpp"
 #include "numbers.hpp"
+#include "parts.hpp"
 #include "planner.hpp"
 
 namespace fhash {
 namespace {
 
 constexpr double WEIGHT = 0.09, TRELLIS_WEIGHT = 0.27;  // squared steps that a bit is worth
-constexpr int8_t TRELLIS_OFFSETS[OFFSET_COUNT] = {17, -10, -5, -3, -2, -1};
 constexpr int MAX_EFFORT = 9, MAX_LABELS = 65536, FEW_LABELS = 256;
 constexpr double REGION_SHARE = 0.5;  // of vertices with an equal neighbour: labels may be many
 constexpr double FIRST_RATIO = 2.5;   // step under a bound, in units of half the quantum
@@ -29,7 +29,6 @@ constexpr int CLEARLY = 4;  // ratio of a deflated tile to its labels: nothing e
 constexpr int64_t TRIED = 1 << 16, PARTS = 4;  // values and parts for trials at effort 2
 constexpr int LINE = 3, PLANE = 12;   // axes t and z, axes y and x, a bit each
 constexpr int64_t ROWS = 4;           // distance in y of the rows that a part's cost is taken from
-constexpr double LEAST_COST = 0.05;   // share of the mean cost that each part has at least
 constexpr int64_t MAX_LINES = 2048;   // that a basis is fitted to
 constexpr int64_t BASIS_WORK = 8;     // of finding a basis of n vectors: n^3 times this
 constexpr int32_t MAX_MISSING = 16;  // that a caller names; with others, at most MAX_MARKED
@@ -38,88 +37,6 @@ constexpr double QUANTUM_SHARE = 1 - 1e-6;    // of twice the largest error, for
 constexpr double MAX_STEPS = 2.5e8;           // largest coefficient, as estimated, in steps
 constexpr double MAX_VALUE = 1e300, MIN_STEP = 1e-290;
 constexpr double MAX_SINGLE = 1e30, MIN_SINGLE = 1e-30;  // for arithmetic in float32
-
-void put_number(Buffer& out, uint64_t bits) {
-    for (int byte = 0; byte < 8; byte++) out.push_back((uint8_t)(bits >> 8 * byte));
-}
-
-void put_block(Buffer& out, const Buffer& block) {
-    put_leb(out, block.size());
-    out.insert(out.end(), block.begin(), block.end());
-}
-
-void put_real(Buffer& out, double number) {
-    uint64_t bits;
-    std::memcpy(&bits, &number, sizeof bits);
-    put_number(out, bits);
-}
-
-// A transform, or a predictor in its place.
-struct Form {
-    uint8_t axes[4];              // kind times 16, plus depth
-    std::array<Buffer, 4> bases;  // packed, of the axes that have one of their own
-    const int* order = nullptr;   // of a predictor; null for a transform
-    const int64_t* levels = nullptr;
-};
-
-// The numbers of settings that a search changes.
-struct Draft {
-    Form form;
-    double step, center, low, high, quantum;
-    bool real64, clip, trellis;
-    Wide origin;
-    int64_t whole_low, whole_high;  // ends of the range about an origin
-
-    std::shared_ptr<const Settings> settings(fhash_context& context, const Shape& shape,
-                                             fhash_error& error) const {
-        Buffer packed;
-        const bool whole = !origin.zero(), predicts = form.order != nullptr;
-        packed.push_back((uint8_t)((real64 ? 1 : 0) | (clip ? 2 : 0) | (trellis ? 8 : 0) |
-                                   (whole ? 16 : 0) | (predicts ? 128 : 0)));
-        packed.insert(packed.end(), form.axes, form.axes + 4);
-        for (const double number : {step, quantum, center}) put_real(packed, number);
-        if (!whole)
-            for (const double end : {low, high}) put_real(packed, end);
-        if (whole) {
-            put_number(packed, (uint64_t)whole_low);
-            put_number(packed, (uint64_t)whole_high);
-            put_number(packed, origin.bits);
-            packed.push_back(origin.negative ? 255 : 0);
-        }
-        const int8_t* const offsets = trellis ? TRELLIS_OFFSETS : PLAIN_OFFSETS;
-        const int8_t none[OFFSET_COUNT] = {0};
-        const int8_t* const shifts = clip ? offsets : none;
-        packed.insert(packed.end(), (const uint8_t*)shifts, (const uint8_t*)shifts + OFFSET_COUNT);
-        for (const Buffer& basis : form.bases)
-            if (!basis.empty()) put_block(packed, basis);
-        if (predicts && !put_predictor(shape, packed, error)) return nullptr;
-        return unpack_settings(context, packed.data(), packed.size(), error);
-    }
-
-    // A predictor by the mean of the two neighbours along the axis of a pass: weights that were
-    // learned would take as long as coding the tile, and more bytes where fronts are sharp.
-    bool put_predictor(const Shape& shape, Buffer& packed, fhash_error& error) const {
-        Predictor predictor;
-        put_real(packed, step);
-        put_real(packed, center);
-        int order = 0;
-        for (size_t a = 0; a < 4; a++) {
-            int64_t& level = predictor.levels[a] = 0;
-            while (level < form.levels[a] && 1 << level < shape[a]) level++;
-            packed.push_back((uint8_t)level);
-            order |= form.order[a] << 2 * a;
-        }
-        packed.push_back((uint8_t)order);
-        packed.push_back(0);
-        make_passes(predictor, form.order, 0);
-        const Shape taps = {1, 1, 1, (int64_t)predictor.taps.size() / 5};
-        std::vector<int32_t> weights((size_t)taps[3], 0);
-        Buffer block;
-        if (!encode_integers(weights, taps, single_band(taps), {}, block, error)) return false;
-        put_block(packed, block);
-        return true;
-    }
-};
 
 // A tile to code, of at least one value that is not marked.
 struct Task {
@@ -341,62 +258,6 @@ void set_bound(Task& task) {
     task.reach = task.error - task.largest() * epsilon;
 }
 
-// A block of a tile, and for how many blocks it stands.
-struct Part {
-    Shape first;
-    double cost, weight;
-};
-struct Parts {
-    Shape shape;
-    std::vector<Part> all;
-};
-
-// A shape of at most `most` values, if the longest of some axes may be halved down to `least`.
-// axes: these, a bit each.
-Shape shortened(Shape shape, int64_t most, int axes, int64_t least) {
-    while (vertices(shape) > most) {
-        int64_t* longest = nullptr;
-        for (size_t a = 0; a < 4; a++)
-            if (axes >> a & 1 && (!longest || shape[a] > *longest)) longest = &shape[a];
-        if (!longest || *longest <= least) break;
-        *longest = (*longest + 1) / 2;
-    }
-    return shape;
-}
-
-template <class Work>
-void each_row(const Shape& of, const Shape& first, const Shape& shape, Work work) {
-    for (int64_t t = first[0]; t < first[0] + shape[0]; t++)
-        for (int64_t z = first[1]; z < first[1] + shape[1]; z++)
-            for (int64_t y = first[2]; y < first[2] + shape[2]; y++)
-                work(((t * of[1] + z) * of[2] + y) * of[3] + first[3]);
-}
-
-// Some of the parts of a tile: those of about the same cost are a group, of which the one in the
-// middle stands for all. All groups cost the same, so that a costly part stands for few.
-std::vector<Part> strata(std::vector<Part> all, size_t most) {
-    std::sort(all.begin(), all.end(),
-              [](const Part& a, const Part& b) { return a.cost < b.cost; });
-    double total = 0, so_far = 0;
-    for (const Part& part : all) total += part.cost;
-    const double least = total > 0 ? LEAST_COST * total / (double)all.size() : 1.0;
-    total += least * (double)all.size();
-    std::vector<Part> chosen;
-    size_t group = 0;
-    for (size_t first = 0, i = 0; i < all.size(); i++) {
-        so_far += all[i].cost + least;
-        const bool last = i + 1 == all.size();
-        const double next = last ? 0 : so_far + all[i + 1].cost + least;
-        const auto number = (size_t)(next / total * (double)most * (1 - 1e-12));
-        if (!last && number == group) continue;
-        chosen.push_back(all[(first + i + 1) / 2]);
-        chosen.back().weight = (double)(i + 1 - first);
-        group = number;
-        first = i + 1;
-    }
-    return chosen;
-}
-
 // A value that is as often exceeded as not. It is that of a plateau, where there is one: of zeros,
 // which are left of it, even a basis makes zeros.
 double typical(const Task& task) {
@@ -509,7 +370,7 @@ struct Given {
 
 // The transform of the lowest price, or the usual one if no values may be priced. It has no bases of long axes, which take more time than the
 // coding of the tile.
-bool plan(const Scaled& scaled, int64_t most, Form& form, fhash_error& error) {
+bool plan(const Scaled& scaled, int64_t most, bool bases, Form& form, fhash_error& error) {
     const Task& task = scaled.task;
     fhash_plan_task asked = {};
     Given columns, sheets;
@@ -527,7 +388,7 @@ bool plan(const Scaled& scaled, int64_t most, Form& form, fhash_error& error) {
     }
     for (size_t a = 0; a < 4; a++) {
         const int64_t n = task.shape[a];
-        if (most == 0 || scaled.real64 || n < 2 || BASIS_WORK * n * n * n > task.size()) continue;
+        if (!bases || scaled.real64 || n < 2 || BASIS_WORK * n * n * n > task.size()) continue;
         lines[a] = scaled.lines(a, asked.line_counts[a]);
         asked.lines[a] = lines[a].data();
     }
@@ -658,26 +519,37 @@ struct Trials {
                take(predicted(task, draft, order, REFINED[1]), WEIGHT, best);
     }
 
-    // The transform that is planned, beside the usual one where both fit the windows.
+    // The transform that is planned, beside the usual one. Prices know the mean error: a basis may
+    // leave a thin front to the residual. Where it is not better, one without bases is planned.
     bool transform(Trial& best, Trial& foretold) {
-        Draft draft = begin.draft;
-        draft.form = {};
-        if (!plan(scaled, most, draft.form, error)) return false;
-        const Shape before = windows.shape;
-        windows = cut(draft.form);
-        if (windows.shape != before) {
-            best.bytes = 0;
-            if (foretold.bytes > 0 && !foretold.run(scaled.task, windows, error)) return false;
+        for (const bool bases : {true, false}) {
+            Draft draft = begin.draft;
+            draft.form = {};
+            if (!plan(scaled, most, bases, draft.form, error)) return false;
+            const Shape before = windows.shape;
+            windows = cut(draft.form);
+            if (windows.shape != before) {
+                if (!best.run(scaled.task, windows, error)) return false;
+                if (foretold.bytes > 0 && !foretold.run(scaled.task, windows, error)) return false;
+            }
+            const double usual = best.bytes;
+            const auto& of = draft.form.bases;
+            if (!take(draft, WEIGHT, best)) return false;
+            if (best.bytes < usual ||
+                std::all_of(of.begin(), of.end(), [](const Buffer& one) { return one.empty(); }))
+                break;
         }
-        return take(draft, WEIGHT, best);
+        return true;
     }
 
     // Other steps and the trellis: a residual that no price knows competes with the step.
     bool refine(Trial& best) const {
         for (const double ratio : OTHER_RATIOS) {
             Draft draft = best.draft;
+            const double before = best.bytes;
             draft.step = ratio * scaled.task.reach;
             if (!take(draft, WEIGHT, best)) return false;
+            if (best.bytes < before) break;  // then a finer step is not better, too
         }
         Draft draft = best.draft;
         draft.trellis = true;
@@ -735,7 +607,7 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     Form& form = trial.draft.form;
     const bool bounded = task.error >= 0, priced = !bounded && !task.quality.transform_given;
     if (task.quality.transform_given) std::copy_n(task.quality.transform, 4, form.axes);
-    else if (!plan(scaled, priced ? most : 0, form, error)) return false;
+    else if (!plan(scaled, priced ? most : 0, priced, form, error)) return false;
     if (bounded && effort > 1 && !best_trial(scaled, most, trial, error)) return false;
     const auto settings = trial.draft.settings(task.context, task.shape, error);
     if (!settings) return false;
