@@ -36,19 +36,28 @@ constexpr double MAX_STEPS = 2.5e8;           // largest coefficient, as estimat
 constexpr double MAX_VALUE = 1e300, MIN_STEP = 1e-290;
 constexpr double MAX_SINGLE = 1e30, MIN_SINGLE = 1e-30;  // for arithmetic in float32
 
+// Every so many of the values less the origin, those that do not count as NaN.
+std::vector<double> numbers_of(const Task& task, int64_t every) {
+    std::vector<double> numbers((size_t)((task.size() + every - 1) / every));
+    with_type(task.type, [&](auto value) {
+        const auto* const all = (const decltype(value)*)(const void*)task.values;
+        for (size_t i = 0; i < numbers.size(); i++) {
+            const int64_t at = (int64_t)i * every;
+            numbers[i] = task.counts(at) ? number_of(task, all[at]) : std::nan("");
+        }
+        return true;
+    });
+    return numbers;
+}
+
 // A value that is as often exceeded as not. It is that of a plateau, where there is one: of zeros,
 // which are left of it, even a basis makes zeros.
 double typical(const Task& task) {
-    std::vector<double> some;
-    with_type(task.type, [&](auto value) {
-        const auto* const all = (const decltype(value)*)(const void*)task.values;
-        for (int64_t i = 0; i < task.size(); i += 1 + task.size() / TRIED)
-            if (task.counts(i)) some.push_back(number_of(task, all[i]));
-        return true;
-    });
-    if (some.empty()) return task.center();
-    const auto middle = some.begin() + (int64_t)some.size() / 2;
-    std::nth_element(some.begin(), middle, some.end());
+    std::vector<double> some = numbers_of(task, 1 + task.size() / TRIED);
+    const auto end = std::remove_if(some.begin(), some.end(), [](double x) { return x != x; });
+    if (end == some.begin()) return task.center();
+    const auto middle = some.begin() + (end - some.begin()) / 2;
+    std::nth_element(some.begin(), middle, end);
     return *middle;
 }
 
@@ -59,15 +68,12 @@ struct Scaled {
     std::vector<float> values;
 
     Scaled(const Task& of, const Draft& draft) : task(of), real64(draft.real64) {
-        with_type(task.type, [&](auto value) {
-            const auto* const all = (const decltype(value)*)(const void*)task.values;
-            values.resize((size_t)task.size());
-            for (int64_t i = 0; i < task.size(); i++) {
-                const double number = task.counts(i) ? number_of(task, all[i]) : draft.center;
-                values[(size_t)i] = (float)((number - draft.center) / draft.step);
-            }
-            return true;
-        });
+        const std::vector<double> numbers = numbers_of(task, 1);
+        values.resize(numbers.size());
+        for (size_t i = 0; i < numbers.size(); i++)
+            values[i] = numbers[i] == numbers[i]
+                            ? (float)((numbers[i] - draft.center) / draft.step)
+                            : 0.0f;
     }
 
     // The approximate bits of a part, by the differences of neighbours along x.

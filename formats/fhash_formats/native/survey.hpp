@@ -97,6 +97,28 @@ template <class O> std::vector<O> far_values(const Task& task, const O* values) 
     return far;
 }
 
+// Marks planes of zeros beside others; false where the bits of so many cannot be kept.
+bool mark_planes(Task& task, const std::array<std::vector<bool>, 4>& zeros) {
+    const int64_t n = task.size();
+    const auto has = [&](bool kind) {
+        return std::any_of(zeros.begin(), zeros.end(), [&](const std::vector<bool>& planes) {
+            return std::find(planes.begin(), planes.end(), kind) != planes.end();
+        });
+    };
+    if (has(true) && has(false)) {
+        int64_t i = 0;
+        for (int64_t t = 0; t < task.shape[0]; t++)
+            for (int64_t z = 0; z < task.shape[1]; z++)
+                for (int64_t y = 0; y < task.shape[2]; y++)
+                    for (int64_t x = 0; x < task.shape[3]; x++, i++)
+                        if ((zeros[0][(size_t)t] || zeros[1][(size_t)z] || zeros[2][(size_t)y] ||
+                             zeros[3][(size_t)x]) &&
+                            !mark(0, i, n, task.marks))
+                            return false;
+    }
+    return true;
+}
+
 // Marks the values that are not finite, those that the caller calls missing, those that nobody
 // wrote, and those far from all others. false where the bits of so many cannot be kept.
 template <class O> bool mark_all(Task& task, const O* values, const void* missing, size_t count) {
@@ -120,23 +142,7 @@ template <class O> bool mark_all(Task& task, const O* values, const void* missin
         if (std::isfinite(real(value))) wanted.push_back(bits_of(value));
     }
     if (!mark_bits(wanted)) return false;
-    const auto zeros = zero_planes(task, values);
-    const auto has = [&](bool kind) {
-        return std::any_of(zeros.begin(), zeros.end(), [&](const std::vector<bool>& planes) {
-            return std::find(planes.begin(), planes.end(), kind) != planes.end();
-        });
-    };
-    if (has(true) && has(false)) {
-        int64_t i = 0;
-        for (int64_t t = 0; t < task.shape[0]; t++)
-            for (int64_t z = 0; z < task.shape[1]; z++)
-                for (int64_t y = 0; y < task.shape[2]; y++)
-                    for (int64_t x = 0; x < task.shape[3]; x++, i++)
-                        if ((zeros[0][(size_t)t] || zeros[1][(size_t)z] || zeros[2][(size_t)y] ||
-                             zeros[3][(size_t)x]) &&
-                            !mark(0, i, n, task.marks))
-                            return false;
-    }
+    if (!mark_planes(task, zero_planes(task, values))) return false;
     wanted.clear();
     for (const O& value : far_values(task, values)) wanted.push_back(bits_of(value));
     return mark_bits(wanted);
