@@ -17,7 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.tiles import Coding, Outcome, Tile, Worked, code, code_tiles, padded_tile
+from fhash_codec.compact.tiles import (
+    Coding,
+    Outcome,
+    Tile,
+    Worked,
+    code,
+    code_tiles,
+    coding_of,
+    padded_tile,
+)
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import brief_quality, full_header, write_coordinates
 from fhash_codec.measure.errors import Errors, ErrorSums, error_sums
@@ -503,21 +512,15 @@ def _coder(
     value_range: ValueRange,
 ) -> LayerCoder:
     """The coder of further layers: options of the encoder as the file's effort asks for."""
-    effort = header["config"].get("effort")
+    effort = header["config"].get("effort", EncodeConfig().effort)
     config = EncodeConfig(max_error=bound_of_file(header))
     goal = goal_of(config, value_range, 1, 0, integers=table.dtype.kind in "iu")
     try:
         fast = parse_stream(table.coded((0,) * len(table.grid))).fast
     except DamagedFileError as error:
         raise DamagedFileError(f"{path}: {error}") from error
-    coding = Coding(
-        fast=fast,
-        weight=TRELLIS_WEIGHT if settings.trellis else WEIGHT,
-        filled=True,
-        density=0,
-        passes=1 if effort in (1, 2) else 2,
-        rounds=0 if effort == 1 else 2,
-    )
+    weight = TRELLIS_WEIGHT if settings.trellis else WEIGHT
+    coding = coding_of(effort, fast=fast, weight=weight, filled=True, density=0)
     t, z, y, x = table.chunk_shape
     return LayerCoder(
         tile=(t, z, y, x), settings=settings, coding=goal.bounded(coding), dtype=table.dtype

@@ -49,7 +49,7 @@ from fhash_formats.transform.tile_format import Shape, TileSettings
 
 MAX_TILE_LENGTH = 1 << 24
 """Vertices of a tile along an axis, at most."""
-_SWITCHES = ("filled", "keep_missing", "own_settings", "exact", "fast", "rough")
+_SWITCHES = ("filled", "keep_missing", "own_settings", "exact", "fast")
 """Options of the encoder that are true or false."""
 _COUNTS = ("rounds", "passes")
 """Options of the encoder that count how often it does something."""

@@ -46,6 +46,8 @@ PART_VERTICES = 1 << 16
 """Vertices of a part that is priced: smaller ones take longer for each vertex."""
 PRICED_VERTICES = 1 << 18
 """Vertices of all parts of one kind: prices of twice as many chose the same within 0.5 %."""
+QUICK_SHARE = 0.25
+"""Share of all these vertices that effort 1 prices and codes."""
 OF_PLATEAU = 4
 """Vertices of parts beside a plateau, where they cost little, as a multiple of the usual ones.
 
@@ -357,7 +359,7 @@ def by_prices(
     sheets, tiles, block = None, _candidates(task), None
     if columns.blocks.tile[2:] != view.shape[2:]:
         sheets = _parts(task, view, settings, sheet_of, larger)
-    if len(tiles) > 1:
+    if len(tiles) > 1 and task.config.effort > 1:
         cut = view.retile(block_of(view.shape, BLOCK_VERTICES))
         costs = part_costs(task, cut, settings.step)
         block = Sample(cut, 1, task.workers, costs, task.parts.tick)
@@ -433,15 +435,16 @@ def _parts(
     view: Blocks,
     settings: TileSettings,
     part_of: Callable[[Shape, int], Shape],
-    larger: int,
+    larger: float,
 ) -> Sample:
     """Return a sample of parts of a series by their costs; a small series is one part.
 
     larger: vertices of each part, and of all, as a multiple of the usual ones.
     """
-    shape, vertices = view.shape, larger * PRICED_VERTICES
+    larger = larger if task.config.effort > 1 else larger * QUICK_SHARE
+    shape, vertices = view.shape, round(larger * PRICED_VERTICES)
     one = prod(shape) <= vertices
-    blocks = view.retile(shape if one else part_of(shape, larger * PART_VERTICES))
+    blocks = view.retile(shape if one else part_of(shape, round(larger * PART_VERTICES)))
     costs = part_costs(task, blocks, settings.step)
     vertices = max(vertices, prod(blocks.tile))
     return Sample(blocks, vertices, task.workers, costs, task.parts.tick)

@@ -37,6 +37,11 @@ ROWS = 30_000
 """Vertices of a pass that its weights are trained on."""
 TRIAL_ROWS = 8_000
 """Vertices of a pass that its weights are trained on for a trial."""
+HOPELESS_MEAN = 1.4
+"""Size without weights, as a multiple of the rival's, from which on none are trained.
+
+Weights saved a quarter at most.
+"""
 HOPELESS = 1.1
 """Size of the first trial, as a multiple of the rival's, from which on no other trial helps."""
 ROUNDS = 4
@@ -115,17 +120,10 @@ def best_predictor(
     """
     plain = _predictor(step, origin, (0, 0, 0, 0), ORDERS[0], 0, None)
     coded = parts.map(lambda tile: _quantised(tile, plain))
-    training_tiles = coded
-    if sample.blocks.in_memory and prod(sample.blocks.shape) <= MAX_TRAINING_VERTICES:
-        training_tiles = list(sample.map_all(lambda tile: _quantised(tile, plain)))
-    training = [
-        tile
-        for tile in training_tiles
-        if tile is not None and (tile.counted is None or tile.counted.any())
-    ]
     codable = [tile for tile in coded if tile is not None]
-    if not training or len(codable) < len(coded):
+    if len(codable) < len(coded):
         return None
+    training: list[IntegerTile] = []
 
     def run(levels: Axes, order: Axes, reach: int, rows: int = TRIAL_ROWS) -> _Trial:
         """Code the parts by a predictor whose weights are trained on some rows; by 0 if none."""
@@ -133,16 +131,24 @@ def best_predictor(
             min(level, (length - 1).bit_length())
             for level, length in zip(levels, codable[0].integers.shape, strict=True)
         )
-        tiles = training if rows else None
-        predictor = _predictor(step, origin, (t, z, y, x), order, reach, tiles, rows)
+        of_weights = training if rows else None
+        predictor = _predictor(step, origin, (t, z, y, x), order, reach, of_weights, rows)
         sizes = zip(parts.weights, _coded_sizes(codable, predictor), strict=True)
         parts.tick()
         return _Trial(sum(w * n for w, n in sizes) + _weight_bytes(predictor), predictor)
 
     # The mean of two neighbours is best at sharp fronts: all others smear them.
     plain_trials = [run(levels, order, 0, rows=0) for order in PLAIN_ORDERS for levels in DEPTHS]
-    best = run(DEPTHS[0], ORDERS[0], 1)
     mean = min(plain_trials, key=lambda trial: trial.size)
+    if mean.size > HOPELESS_MEAN * rival:
+        return None
+    tiles = coded
+    if sample.blocks.in_memory and prod(sample.blocks.shape) <= MAX_TRAINING_VERTICES:
+        tiles = list(sample.map_all(lambda tile: _quantised(tile, plain)))
+    training += [
+        tile for tile in tiles if tile is not None and (tile.counted is None or tile.counted.any())
+    ]
+    best = run(DEPTHS[0], ORDERS[0], 1)
     if min(best.size, mean.size) > HOPELESS * rival:
         return None
     for order in ORDERS[1:] if effort > 2 else ():

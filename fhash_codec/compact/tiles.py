@@ -315,6 +315,11 @@ class Coding(coder.Coding):
     """Part of the promise about the bulk, which changes what is measured and no byte."""
 
 
+def coding_of(effort: int, **options: Any) -> Coding:
+    """Return the options of the encoder at an effort. options: others that it has."""
+    return Coding(passes=2 if effort > 2 else 1, rounds=2 if effort < 7 else 4, **options)
+
+
 def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
     """Return settings and coding with the trellis, at about the same error."""
     return with_trellis(settings), replace(coding, weight=TRELLIS_WEIGHT)

@@ -31,7 +31,7 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import LEAST_GAIN, choose_head, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
 from fhash_codec.compact.masks import with_mask
-from fhash_codec.compact.planner import block_of, by_prices, in_part, part_costs
+from fhash_codec.compact.planner import QUICK_SHARE, block_of, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import (
@@ -39,6 +39,7 @@ from fhash_codec.compact.tiles import (
     Blocks,
     Coding,
     Outcome,
+    coding_of,
     off_trellis,
     on_trellis,
 )
@@ -132,13 +133,7 @@ def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int)
         tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
         tell("plan", f"--access {config.access}: {tiling.describe()}")
     tiled = view.retile(found.tile)
-    coding = Coding(
-        filled=density == 0,
-        density=density,
-        bulk=goal.bulk,
-        passes=2 if config.effort > 2 else 1,
-        rounds=2 if config.effort < 7 else 4,
-    )
+    coding = coding_of(config.effort, filled=density == 0, density=density, bulk=goal.bulk)
     with stage("step", "coder and step, by coding some parts"):
         parts = coded_parts(task, tiled, settings.step)
         attempt = _coded(task, settings, coding, tiled, parts, found.size)
@@ -217,7 +212,8 @@ def coded_parts(task: PlanTask, tiled: Blocks, step: float) -> Sample:
     """Return the parts of the tiles that are coded."""
     blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
     costs = part_costs(task, blocks, step)
-    return Sample(blocks, CODED_VERTICES, task.workers, costs, task.parts.tick)
+    vertices = CODED_VERTICES if task.config.effort > 1 else round(QUICK_SHARE * CODED_VERTICES)
+    return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
 
 
 def with_fill(coding: Coding) -> Coding:
@@ -246,8 +242,11 @@ def _coded(
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
         moved, _ = on_trellis(moved, coding)
+    slow = task.is_slow(tiled.tile, size)
+    if slow and task.config.effort == 1:
+        coding = replace(coding, fast=True)
     outcome = parts.run(moved, goal.bounded(with_fill(coding)))
-    if task.is_slow(tiled.tile, size):
+    if slow and not coding.fast:
         faster = replace(coding, fast=True)
         other = parts.run(moved, goal.bounded(with_fill(faster)))
         ratio = _at_promise(other, goal) / max(_at_promise(outcome, goal), 1.0)

@@ -1,403 +1,370 @@
-// Encoding of a tile to a stated quality: the search for a transform and a quantisation step.
-#include <cfloat>
+// Encoding of a tile to a stated quality. The planner finds its transform by prices (planner.cpp);
+// trials on some of its parts find the step that takes the fewest bytes under a bound, and whether
+// a predictor takes fewer.
 #include <cstdlib>
 
 #include "core.hpp"
-#include "encode.hpp"
-#include "numbers.hpp"
+#include "draft.hpp"
+#include "parts.hpp"
+#include "planner.hpp"
+#include "survey.hpp"
 
 namespace fhash {
 namespace {
 
 constexpr double WEIGHT = 0.09, TRELLIS_WEIGHT = 0.27;  // squared steps that a bit is worth
-constexpr int8_t TRELLIS_OFFSETS[OFFSET_COUNT] = {17, -10, -5, -3, -2, -1};
-constexpr int MAX_DEPTHS[4] = {1, 1, 5, 5};  // of a 9/7 transform along t, z, y, x
 constexpr int MAX_EFFORT = 9, MAX_LABELS = 65536, FEW_LABELS = 256;
 constexpr double REGION_SHARE = 0.5;  // of vertices with an equal neighbour: labels may be many
 constexpr double FIRST_RATIO = 2.5;   // step under a bound, in units of half the quantum
 constexpr double OTHER_RATIOS[] = {4.0, 1.6};
+constexpr double FAR = 1.3;     // the same of the usual transform, that another one may save
+constexpr double CLOSE = 1.15;  // bytes beside those of a predictor that other steps may save
+// Orders in which a predictor refines the axes, the best predicted one last, and how often it does.
+constexpr int ORDERS[2][4] = {{0, 1, 2, 3}, {3, 2, 1, 0}};
+constexpr int64_t REFINED[2][4] = {{2, 3, 3, 3}, {0, 3, 3, 3}};
+constexpr double MAX_FORETOLD = 1 << 26;  // half the range in steps: predicted integers are small
+constexpr double MAX_WHOLE = 0x1p40;      // bound on integers whose steps are exact
 constexpr int CLEARLY = 4;  // ratio of a deflated tile to its labels: nothing else is tried
-constexpr int64_t MAX_WINDOW = 1 << 16;       // values on which settings are tried at effort 2
+constexpr int64_t TRIED = 1 << 16, PARTS = 4;  // values and parts for trials at effort 2
+constexpr int LINE = 3, PLANE = 12;   // axes t and z, axes y and x, a bit each
+constexpr int64_t ROWS = 4;           // distance in y of the rows that a part's cost is taken from
+constexpr int64_t MAX_LINES = 2048;   // that a basis is fitted to
+constexpr int64_t BASIS_WORK = 8;     // of finding a basis of n vectors: n^3 times this
 constexpr int32_t MAX_MISSING = 16;  // that a caller names; with others, at most MAX_MARKED
-constexpr size_t FAR_VALUES = 4;  // _FillValue, missing_value and two flags, at either end
 constexpr double QUANTUM_SHARE = 1 - 1e-6;    // of twice the largest error, for its rounding
 constexpr double MAX_STEPS = 2.5e8;           // largest coefficient, as estimated, in steps
 constexpr double MAX_VALUE = 1e300, MIN_STEP = 1e-290;
 constexpr double MAX_SINGLE = 1e30, MIN_SINGLE = 1e-30;  // for arithmetic in float32
 
-struct Spec {
-    uint8_t axes[4];  // kind times 16, plus depth
-
-    bool operator==(const Spec& other) const { return std::equal(axes, axes + 4, other.axes); }
-};
-
-int bit_length(int64_t n) {
-    int bits = 0;
-    for (; n; n >>= 1) bits++;
-    return bits;
-}
-
-// The transforms to try, each once: 9/7 along all axes; then Haar, and then none, along the first
-// axis longer than 1, which often is time; then Haar along all axes.
-std::vector<Spec> candidates(const Shape& shape) {
-    size_t first = 0;
-    while (first < 4 && shape[first] == 1) first++;
-    if (first == 4) return {Spec{{0, 0, 0, 0}}};
-    int depths[4];
-    for (size_t a = 0; a < 4; a++)
-        depths[a] = shape[a] < 2
-                        ? 0
-                        : std::max(1, std::min(MAX_DEPTHS[a], bit_length(shape[a]) - 3));
-    if (std::min(shape[2], shape[3]) >= 16) depths[2] = depths[3] = std::min(depths[2], depths[3]);
-    // Few tiles are long in time: there, two levels of Haar are worth it.
-    const int haar = first < 2 ? std::min(2, bit_length(shape[first]) - 1) : depths[first];
-    std::vector<Spec> specs;
-    const auto add = [&](int kind, int first_kind, int first_depth) {
-        Spec spec;
-        for (size_t a = 0; a < 4; a++)
-            spec.axes[a] = (uint8_t)(depths[a] ? kind << 4 | depths[a] : 0);
-        spec.axes[first] = (uint8_t)(first_kind << 4 | first_depth);
-        if (std::find(specs.begin(), specs.end(), spec) == specs.end()) specs.push_back(spec);
-    };
-    add(DAUBECHIES_KIND, DAUBECHIES_KIND, depths[first]);
-    add(DAUBECHIES_KIND, HAAR_KIND, haar);
-    add(DAUBECHIES_KIND, NONE_KIND, 0);
-    add(HAAR_KIND, HAAR_KIND, haar);
-    return specs;
-}
-
-// The numbers of settings that a search changes.
-struct Draft {
-    Spec spec;
-    double step, center, low, high, quantum;
-    bool real64, clip, trellis;
-    Wide origin;
-    int64_t whole_low, whole_high;  // ends of the range about an origin
-
-    std::shared_ptr<const Settings> settings(fhash_context& context, fhash_error& error) const {
-        Buffer packed;
-        const bool whole = !origin.zero();
-        packed.push_back((uint8_t)((real64 ? 1 : 0) | (clip ? 2 : 0) | (trellis ? 8 : 0) |
-                                   (whole ? 16 : 0)));
-        packed.insert(packed.end(), spec.axes, spec.axes + 4);
-        const auto put = [&](uint64_t bits) {
-            for (int byte = 0; byte < 8; byte++) packed.push_back((uint8_t)(bits >> 8 * byte));
-        };
-        const auto put_real = [&](double number) {
-            uint64_t bits;
-            std::memcpy(&bits, &number, sizeof bits);
-            put(bits);
-        };
-        for (const double number : {step, quantum, center}) put_real(number);
-        if (!whole)
-            for (const double end : {low, high}) put_real(end);
-        if (whole) {
-            put((uint64_t)whole_low);
-            put((uint64_t)whole_high);
-            put(origin.bits);
-            packed.push_back(origin.negative ? 255 : 0);
-        }
-        const int8_t* const offsets = trellis ? TRELLIS_OFFSETS : PLAIN_OFFSETS;
-        const int8_t none[OFFSET_COUNT] = {0};
-        const int8_t* const shifts = clip ? offsets : none;
-        packed.insert(packed.end(), (const uint8_t*)shifts, (const uint8_t*)shifts + OFFSET_COUNT);
-        return unpack_settings(context, packed.data(), packed.size(), error);
-    }
-};
-
-// A tile to code, of at least one value that is not marked.
-struct Task {
-    fhash_context& context;
-    Shape shape;
-    int32_t type;
-    const uint8_t* values;
-    const fhash_quality& quality;
-    Marks marks;  // of what comes back bit by bit, and takes no part in range and bound
-    Wide origin;
-    double low, high;      // of the other values, less the origin
-    int64_t whole_low, whole_high;  // the same, of integers
-    double ends[2];        // likewise, of the range that a relative bound is of
-    double error, reach;   // bound on decoded values, below 0 for none; and before they are rounded
-    bool signed_zero;      // a zero has a sign, or a value is below 0
-
-    int64_t size() const { return vertices(shape); }
-    bool whole() const { return type < FHASH_FLOAT16; }
-    size_t bytes() const { return (size_t)size() * fhash_type_size(type); }
-    bool lossless() const {
-        return error >= 0 && error < (whole() ? 1.0 : 4.9406564584124654e-324);
-    }
-    double half_range() const { return high / 2 - low / 2; }
-    double center() const { return low + half_range(); }
-    double largest() const { return std::max(std::fabs(low), std::fabs(high)); }
-};
-
-// Whether whole planes along an axis are zeros, by axis and place: where nothing was written yet,
-// stores have zeros unless they have another fill value.
-template <class O> std::array<std::vector<bool>, 4> zero_planes(const Task& task, const O* values) {
-    std::array<std::vector<int64_t>, 4> others;
-    for (size_t axis = 0; axis < 4; axis++) others[axis].assign((size_t)task.shape[axis], 0);
-    int64_t i = 0;
-    for (int64_t t = 0; t < task.shape[0]; t++)
-        for (int64_t z = 0; z < task.shape[1]; z++)
-            for (int64_t y = 0; y < task.shape[2]; y++)
-                for (int64_t x = 0; x < task.shape[3]; x++, i++) {
-                    const int64_t there = bits_of(values[i]) != 0;
-                    const int64_t place[4] = {t, z, y, x};
-                    for (size_t axis = 0; axis < 4; axis++)
-                        others[axis][(size_t)place[axis]] += there;
-                }
-    std::array<std::vector<bool>, 4> zeros;
-    for (size_t axis = 0; axis < 4; axis++)
-        for (const int64_t count : others[axis]) zeros[axis].push_back(count == 0);
-    return zeros;
-}
-
-// Values at the ends of the range that are farther from all others than these are from each other,
-// such as -999 in a file that says so where no coder looks. They would cost bytes, and weaken a
-// relative bound.
-template <class O> std::vector<O> far_values(const Task& task, const O* values) {
-    std::vector<O> ends[2];  // the least different values ascending, and the largest descending
-    const auto take = [](std::vector<O>& of, const O& value, auto before) {
-        if (of.size() > FAR_VALUES && !before(value, of.back())) return;
-        const auto at = std::lower_bound(of.begin(), of.end(), value, before);
-        if (at != of.end() && !before(value, *at)) return;
-        of.insert(at, value);
-        if (of.size() > FAR_VALUES + 1) of.pop_back();
-    };
-    const auto less = [](const O& a, const O& b) { return value_of(a) < value_of(b); };
-    const auto more = [](const O& a, const O& b) { return value_of(a) > value_of(b); };
-    for (int64_t i = 0; i < task.size(); i++) {
-        if (!task.marks.of.empty() && task.marks.of[(size_t)i]) continue;
-        take(ends[0], values[i], less);
-        take(ends[1], values[i], more);
-    }
-    std::vector<O> far;
-    size_t best[2] = {0, 0};  // values of either end that are far, of which as many as possible
-    for (size_t i = 0; i < ends[0].size(); i++)
-        for (size_t j = 0; j < ends[1].size(); j++) {
-            const double low = real(ends[0][i]), high = real(ends[1][j]), range = high - low;
-            const bool far_low = i == 0 || low - real(ends[0][i - 1]) > range;
-            const bool far_high = j == 0 || real(ends[1][j - 1]) - high > range;
-            if (range >= 0 && far_low && far_high && i + j > best[0] + best[1]) {
-                best[0] = i;
-                best[1] = j;
-            }
-        }
-    for (int side = 0; side < 2; side++)
-        far.insert(far.end(), ends[side].begin(), ends[side].begin() + (int64_t)best[side]);
-    return far;
-}
-
-// Marks the values that are not finite, those that the caller calls missing, those that nobody
-// wrote, and those far from all others. false where the bits of so many cannot be kept.
-template <class O> bool mark_all(Task& task, const O* values, const void* missing, size_t count) {
-    const int64_t n = task.size();
-    const bool every_bit = task.quality.max_error == 0;
-    if (!mark_not_finite(values, task.type, n, every_bit, task.marks)) return false;
-    if (every_bit) return true;
-    const auto mark_bits = [&](const std::vector<uint64_t>& wanted) {
-        for (int64_t i = 0; i < n && !wanted.empty(); i++) {
-            const uint64_t bits = bits_of(values[i]);
-            if (std::find(wanted.begin(), wanted.end(), bits) != wanted.end() &&
-                !mark(bits, i, n, task.marks))
-                return false;
+// Every so many of the values less the origin, those that do not count as NaN.
+std::vector<double> numbers_of(const Task& task, int64_t every) {
+    std::vector<double> numbers((size_t)((task.size() + every - 1) / every));
+    with_type(task.type, [&](auto value) {
+        const auto* const all = (const decltype(value)*)(const void*)task.values;
+        for (size_t i = 0; i < numbers.size(); i++) {
+            const int64_t at = (int64_t)i * every;
+            numbers[i] = task.counts(at) ? number_of(task, all[at]) : std::nan("");
         }
         return true;
-    };
-    std::vector<uint64_t> wanted;
-    for (size_t i = 0; i < count; i++) {
-        O value;
-        std::memcpy(&value, (const uint8_t*)missing + i * sizeof(O), sizeof(O));
-        if (std::isfinite(real(value))) wanted.push_back(bits_of(value));
+    });
+    return numbers;
+}
+
+// A value that is as often exceeded as not. It is that of a plateau, where there is one: of zeros,
+// which are left of it, even a basis makes zeros.
+double typical(const Task& task) {
+    std::vector<double> some = numbers_of(task, 1 + task.size() / TRIED);
+    const auto end = std::remove_if(some.begin(), some.end(), [](double x) { return x != x; });
+    if (end == some.begin()) return task.center();
+    const auto middle = some.begin() + (end - some.begin()) / 2;
+    std::nth_element(some.begin(), middle, end);
+    return *middle;
+}
+
+// The values of a tile about its centre in steps, and choices of its parts.
+struct Scaled {
+    const Task& task;
+    const bool real64;
+    std::vector<float> values;
+
+    Scaled(const Task& of, const Draft& draft) : task(of), real64(draft.real64) {
+        const std::vector<double> numbers = numbers_of(task, 1);
+        values.resize(numbers.size());
+        for (size_t i = 0; i < numbers.size(); i++)
+            values[i] = numbers[i] == numbers[i]
+                            ? (float)((numbers[i] - draft.center) / draft.step)
+                            : 0.0f;
     }
-    if (!mark_bits(wanted)) return false;
-    const auto zeros = zero_planes(task, values);
-    const auto has = [&](bool kind) {
-        return std::any_of(zeros.begin(), zeros.end(), [&](const std::vector<bool>& planes) {
-            return std::find(planes.begin(), planes.end(), kind) != planes.end();
+
+    // The approximate bits of a part, by the differences of neighbours along x.
+    double cost(const Shape& first, const Shape& shape) const {
+        double bits = 0;
+        int64_t row = 0;
+        each_row(task.shape, first, shape, [&](int64_t at) {
+            if (row++ % ROWS) return;
+            for (int64_t i = at + 1; i < at + shape[3]; i++)
+                bits += std::log2(1 + std::fabs(values[(size_t)i] - values[(size_t)i - 1]));
         });
-    };
-    if (has(true) && has(false)) {
-        int64_t i = 0;
-        for (int64_t t = 0; t < task.shape[0]; t++)
-            for (int64_t z = 0; z < task.shape[1]; z++)
-                for (int64_t y = 0; y < task.shape[2]; y++)
-                    for (int64_t x = 0; x < task.shape[3]; x++, i++)
-                        if ((zeros[0][(size_t)t] || zeros[1][(size_t)z] || zeros[2][(size_t)y] ||
-                             zeros[3][(size_t)x]) &&
-                            !mark(0, i, n, task.marks))
-                            return false;
+        return bits;
     }
-    wanted.clear();
-    for (const O& value : far_values(task, values)) wanted.push_back(bits_of(value));
-    return mark_bits(wanted);
-}
 
-// The middle of a range of 64-bit integers of which some are beyond 2^53; 0 for others.
-template <class O> void set_origin(Task& task, O low, O high) {
-    const double most = std::max(std::fabs((double)low), std::fabs((double)high));
-    const auto exact = [](O number) {
-        constexpr uint64_t limit = 1ull << 53;
-        const bool below = number < 0;
-        return (below ? 0 - (uint64_t)number : (uint64_t)number) <= limit;
-    };
-    if (sizeof(O) == 8 && !(exact(low) && exact(high)) && most > 0) {
-        // (low + high + 1) / 2, rounded down
-        const uint64_t width = (uint64_t)high - (uint64_t)low;
-        task.origin.bits = (uint64_t)low + width / 2 + (width & 1);
-        task.origin.negative = low < 0 && (int64_t)task.origin.bits < 0;
+    // Parts of a shape, of at most so many values together, but at least one.
+    Parts parts(const Shape& shape, int64_t most) const {
+        Parts parts = {shape, {}};
+        Shape counts;
+        for (size_t a = 0; a < 4; a++) counts[a] = (task.shape[a] + shape[a] - 1) / shape[a];
+        const bool one = vertices(counts) == 1;
+        for (int64_t number = 0; number < vertices(counts); number++) {
+            Part part = {{}, 0, 1};
+            int64_t rest = number;
+            for (size_t a = 4; a-- > 0; rest /= counts[a])
+                part.first[a] = std::min(rest % counts[a] * shape[a], task.shape[a] - shape[a]);
+            if (!one) part.cost = cost(part.first, shape);
+            parts.all.push_back(part);
+        }
+        const size_t few = (size_t)std::max<int64_t>(1, most / vertices(shape));
+        parts.all = strata(std::move(parts.all), few);
+        return parts;
     }
-    task.whole_low = (int64_t)((uint64_t)low - task.origin.bits);
-    task.whole_high = (int64_t)((uint64_t)high - task.origin.bits);
-    task.low = (double)task.whole_low;
-    task.high = (double)task.whole_high;
-    if (task.origin.zero()) {
-        task.low = (double)low;
-        task.high = (double)high;
-    }
-}
 
-// The range that a relative bound is of: without 0, which stores put where nothing was written.
-template <class O> void set_ends(Task& task, const O* values) {
-    const auto number = [&](const O& value) {
-        if constexpr (is_real<O>) return real(value);
-        else return task.origin.zero() ? real(value)
-                                       : (double)(int64_t)((uint64_t)value - task.origin.bits);
-    };
-    bool any = false;
-    task.ends[0] = task.ends[1] = 0;
-    for (int64_t i = 0; i < task.size(); i++) {
-        if (value_of(values[i]) == 0 || (!task.marks.of.empty() && task.marks.of[(size_t)i]))
-            continue;
-        const double value = number(values[i]);
-        if (!any || value < task.ends[0]) task.ends[0] = value;
-        if (!any || value > task.ends[1]) task.ends[1] = value;
-        any = true;
+    // Lines along an axis, spread evenly.
+    std::vector<float> lines(size_t axis, int64_t& count) const {
+        const int64_t length = task.shape[axis], others = task.size() / length;
+        int64_t stride = 1;
+        for (size_t a = axis + 1; a < 4; a++) stride *= task.shape[a];
+        count = std::min(MAX_LINES, others);
+        std::vector<float> found;
+        for (int64_t line = 0; line < count; line++) {
+            const int64_t number = line * others / count;
+            const int64_t at = number / stride * stride * length + number % stride;
+            for (int64_t i = 0; i < length; i++) found.push_back(values[(size_t)(at + i * stride)]);
+        }
+        return found;
     }
-}
+};
 
-// Range of the values that are not marked; false where all are.
-template <class O> bool survey(Task& task, const O* values) {
-    bool any = false;
-    O low{}, high{};
-    task.signed_zero = false;
-    for (int64_t i = 0; i < task.size(); i++) {
-        if (!task.marks.of.empty() && task.marks.of[(size_t)i]) continue;
-        if constexpr (is_real<O>) task.signed_zero |= std::signbit(real(values[i]));
-        if (!any || value_of(values[i]) < value_of(low)) low = values[i];
-        if (!any || value_of(values[i]) > value_of(high)) high = values[i];
-        any = true;
+// Parts as the planner takes them.
+struct Given {
+    std::vector<float> values;
+    std::vector<uint8_t> counted;
+    std::vector<double> weights;
+
+    fhash_plan_parts of(const Scaled& scaled, const Parts& parts) {
+        const Task& task = scaled.task;
+        double total = 0;
+        for (const Part& part : parts.all) total += part.weight * (double)vertices(parts.shape);
+        for (const Part& part : parts.all) {
+            each_row(task.shape, part.first, parts.shape, [&](int64_t at) {
+                const auto from = scaled.values.begin() + at;
+                values.insert(values.end(), from, from + parts.shape[3]);
+                for (int64_t i = at; i < at + parts.shape[3] && !task.marks.of.empty(); i++)
+                    counted.push_back(task.counts(i));
+            });
+            weights.push_back(part.weight * (double)task.size() / total);
+        }
+        fhash_plan_parts given = {};
+        std::copy_n(parts.shape.begin(), 4, given.shape);
+        given.count = (int64_t)parts.all.size();
+        given.values = values.data();
+        given.counted = counted.empty() ? nullptr : counted.data();
+        given.weights = weights.data();
+        return given;
     }
-    if (!any) return false;
-    if constexpr (is_real<O>) {
-        task.low = real(low);
-        task.high = real(high);
-    } else {
-        set_origin(task, low, high);
+};
+
+// The transform of the lowest price, or the usual one if no values may be priced. It has no bases
+// of long axes, which take more time than the coding of the tile.
+bool plan(const Scaled& scaled, int64_t most, bool bases, Form& form, fhash_error& error) {
+    const Task& task = scaled.task;
+    fhash_plan_task asked = {};
+    Given columns, sheets;
+    std::vector<float> lines[4];
+    std::copy_n(task.shape.begin(), 4, asked.shape);
+    std::copy_n(task.shape.begin(), 4, asked.columns.shape);
+    if (task.size() <= most) {
+        asked.columns = columns.of(scaled, scaled.parts(task.shape, most));
+    } else if (most > 0) {
+        const int64_t each = most / PARTS;
+        const Shape column = shortened(shortened(task.shape, each, PLANE, 8), 2 * each, LINE, 8);
+        const Shape sheet = shortened(shortened(task.shape, each, LINE, 2), each, PLANE, 8);
+        asked.columns = columns.of(scaled, scaled.parts(column, most / 2));
+        asked.sheets = sheets.of(scaled, scaled.parts(sheet, most / 2));
     }
-    if (task.quality.max_error_rel > 0) set_ends(task, values);
+    for (size_t a = 0; a < 4; a++) {
+        const int64_t n = task.shape[a];
+        if (!bases || scaled.real64 || n < 2 || BASIS_WORK * n * n * n > task.size()) continue;
+        lines[a] = scaled.lines(a, asked.line_counts[a]);
+        asked.lines[a] = lines[a].data();
+    }
+    asked.tiles = task.shape.data();
+    asked.tile_count = 1;
+    asked.step = 1;
+    fhash_plan_result found = {};
+    if (!plan_tile(task.context, asked, found, form.bases, error)) return false;
+    for (size_t a = 0; a < 4; a++)
+        form.axes[a] = task.shape[a] < 2 ? 0 : (uint8_t)(found.kinds[a] << 4 | found.depths[a]);
     return true;
 }
 
-// The bound on decoded values, and the largest error before they are rounded to their type.
-void set_bound(Task& task) {
-    const fhash_quality& quality = task.quality;
-    task.error = -1;
-    task.reach = 0;
-    if (quality.step > 0) return;
-    task.error = std::max(quality.max_error, 0.0);
-    if (quality.max_error_rel > 0) {
-        const double fraction = quality.max_error_rel, span = task.ends[1] - task.ends[0];
-        task.error = std::isfinite(span) ? fraction * span
-                                         : fraction * task.ends[1] - fraction * task.ends[0];
-    }
-    if (task.whole()) {
-        task.reach = std::floor(task.error) + 0.5;
-        return;
-    }
-    const double epsilon = task.type == FHASH_FLOAT16   ? 0x1p-10
-                           : task.type == FHASH_FLOAT32 ? FLT_EPSILON
-                                                        : DBL_EPSILON;
-    task.reach = task.error - task.largest() * epsilon;
-}
+// Parts of a tile to code.
+struct Windows {
+    Shape shape;
+    std::vector<Buffer> values;
+    std::vector<Marks> marks;
+    std::vector<double> weights;
 
-// Settings and options of the encoder, and what they made of a window.
-struct Trial {
-    Draft draft;
-    fhash_coding coding;
-    Coded coded;
-    bool whole = false;  // the window was the tile
-
-    bool run(const Task& task, const uint8_t* values, const Marks& marks, const Shape& shape,
-             fhash_error& error) {
-        const auto settings = draft.settings(task.context, error);
-        whole = shape == task.shape;
-        return settings && encode_tile(task.context, settings, shape, task.type, values, nullptr,
-                                       marks, coding, coded, error);
+    Windows(const Task& task, const Parts& parts) : shape(parts.shape) {
+        const size_t width = fhash_type_size(task.type);
+        for (const Part& part : parts.all) {
+            Buffer window;
+            Marks there = {task.marks.values, {}};
+            each_row(task.shape, part.first, shape, [&](int64_t at) {
+                const uint8_t* const from = task.values + (size_t)at * width;
+                window.insert(window.end(), from, from + (size_t)shape[3] * width);
+                if (task.marks.of.empty()) return;
+                const auto of = task.marks.of.begin() + at;
+                there.of.insert(there.of.end(), of, of + shape[3]);
+            });
+            values.push_back(std::move(window));
+            marks.push_back(std::move(there));
+            weights.push_back(part.weight);
+        }
     }
 };
 
-// A block of at most `most` values from the middle of a tile, and their marks.
-Buffer window_of(const Task& task, int64_t most, Shape& lengths, Marks& marks) {
-    lengths = task.shape;
-    while (vertices(lengths) > most) {
-        auto longest = std::max_element(lengths.begin(), lengths.end());
-        *longest = (*longest + 1) / 2;
+// Settings and options of the encoder, and what they made of a tile or its parts.
+struct Trial {
+    Draft draft;
+    fhash_coding coding;
+    double bytes = 0;
+    Coded coded;         // of the tile
+    bool whole = false;  // it is coded
+
+    bool run(const Task& task, fhash_error& error) {
+        whole = true;
+        const auto settings = draft.settings(task.context, task.shape, error);
+        return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
+                                       nullptr, task.marks, coding, coded, error);
     }
-    const size_t width = fhash_type_size(task.type);
-    int64_t start[4];
-    for (size_t a = 0; a < 4; a++) start[a] = (task.shape[a] - lengths[a]) / 2;
-    Buffer window;
-    marks.values = task.marks.values;
-    for (int64_t t = 0; t < lengths[0]; t++)
-        for (int64_t z = 0; z < lengths[1]; z++)
-            for (int64_t y = 0; y < lengths[2]; y++) {
-                const int64_t row = ((start[0] + t) * task.shape[1] + start[1] + z) *
-                                        task.shape[2] + start[2] + y;
-                const int64_t first = row * task.shape[3] + start[3];
-                const uint8_t* const from = task.values + (size_t)first * width;
-                window.insert(window.end(), from, from + (size_t)lengths[3] * width);
-                if (task.marks.of.empty()) continue;
-                const uint16_t* const of = task.marks.of.data() + first;
-                marks.of.insert(marks.of.end(), of, of + lengths[3]);
-            }
-    return window;
+    bool run(const Task& task, const Windows& windows, fhash_error& error) {
+        if (windows.shape == task.shape) {
+            if (!run(task, error)) return false;
+            bytes = (double)coded.data.size();
+            return true;
+        }
+        const auto settings = draft.settings(task.context, task.shape, error);
+        if (!settings) return false;
+        bytes = (double)settings->packed.size();
+        fhash_coding others = coding;
+        others.own_settings = 0;  // a part has the settings of its tile
+        for (size_t i = 0; i < windows.values.size(); i++) {
+            Coded window;
+            if (!encode_tile(task.context, settings, windows.shape, task.type,
+                             windows.values[i].data(), nullptr, windows.marks[i], others, window,
+                             error))
+                return false;
+            bytes += windows.weights[i] * (double)window.data.size();
+        }
+        return true;
+    }
+};
+
+// The draft of a predictor for the same bound.
+Draft predicted(const Task& task, Draft draft, const int* order, const int64_t* levels) {
+    draft.form = {};
+    draft.form.order = order;
+    draft.form.levels = levels;
+    draft.clip = draft.trellis = false;
+    draft.step = 2 * task.reach * QUANTUM_SHARE;
+    if (task.whole() && task.reach < MAX_WHOLE) {  // integers at such a distance keep it exactly
+        draft.step = 2 * task.reach;
+        draft.center = std::nearbyint(draft.center);
+    }
+    return draft;
 }
 
-// The trial of the transform, then the step, then the quantiser that takes the fewest bytes.
-bool best_trial(const Task& task, const std::vector<Spec>& specs, int64_t most, Trial& best,
-                fhash_error& error) {
-    const bool bounded = task.error >= 0;
-    if (specs.size() == 1 && !bounded) return true;
-    Shape lengths;
-    Marks marks;
-    const Buffer window = window_of(task, most, lengths, marks);
-    const auto take_better = [&](Trial trial, bool first) {
-        if (!trial.run(task, window.data(), marks, lengths, error)) return false;
-        if (first || trial.coded.data.size() < best.coded.data.size()) best = std::move(trial);
+// Trials on parts of a tile under a bound.
+struct Trials {
+    const Scaled& scaled;
+    const int64_t most;
+    const Trial begin;
+    fhash_error& error;
+    Windows windows;
+
+    Trials(const Scaled& of, int64_t values, const Trial& first, fhash_error& failed)
+        : scaled(of), most(values), begin(first), error(failed), windows(cut(first.draft.form)) {}
+
+    // Windows that are as long as the tile where a form has a basis, which is for all of an axis.
+    Windows cut(const Form& form) const {
+        const Task& task = scaled.task;
+        int axes = 0;
+        for (size_t a = 0; a < 4; a++) axes |= form.bases[a].empty() << a;
+        const int64_t each = task.size() <= most ? most : most / PARTS;
+        return {task, scaled.parts(shortened(task.shape, each, axes, 1), most)};
+    }
+
+    bool take(const Draft& draft, double weight, Trial& best) const {
+        Trial trial = begin;
+        trial.draft = draft;
+        trial.coding.weight = weight;
+        if (!trial.run(scaled.task, windows, error)) return false;
+        if (best.bytes == 0 || trial.bytes < best.bytes) best = std::move(trial);
         return true;
+    }
+
+    // The best of some predictors, or the first one if a transform takes far fewer bytes.
+    bool predict(const Trial& rival, Trial& best) const {
+        const Task& task = scaled.task;
+        const Draft& draft = begin.draft;
+        for (const int* order : ORDERS) {
+            if (!take(predicted(task, draft, order, REFINED[0]), WEIGHT, best)) return false;
+            if (best.bytes > FAR * rival.bytes) return true;
+        }
+        const int* const order = best.draft.form.order;
+        return task.shape[0] < 2 ||
+               take(predicted(task, draft, order, REFINED[1]), WEIGHT, best);
+    }
+
+    // The transform that is planned, beside the usual one. Prices know the mean error: a basis may
+    // leave a thin front to the residual. Where it is not better, one without bases is planned.
+    bool transform(Trial& best, Trial& foretold) {
+        for (const bool bases : {true, false}) {
+            Draft draft = begin.draft;
+            draft.form = {};
+            if (!plan(scaled, most, bases, draft.form, error)) return false;
+            const Shape before = windows.shape;
+            windows = cut(draft.form);
+            if (windows.shape != before) {
+                if (!best.run(scaled.task, windows, error)) return false;
+                if (foretold.bytes > 0 && !foretold.run(scaled.task, windows, error)) return false;
+            }
+            const double usual = best.bytes;
+            const auto& of = draft.form.bases;
+            if (!take(draft, WEIGHT, best)) return false;
+            if (best.bytes < usual ||
+                std::all_of(of.begin(), of.end(), [](const Buffer& one) { return one.empty(); }))
+                break;
+        }
+        return true;
+    }
+
+    // Other steps and the trellis: a residual that no price knows competes with the step.
+    bool refine(Trial& best) const {
+        for (const double ratio : OTHER_RATIOS) {
+            Draft draft = best.draft;
+            const double before = best.bytes;
+            draft.step = ratio * scaled.task.reach;
+            if (!take(draft, WEIGHT, best)) return false;
+            if (best.bytes < before) break;  // then a finer step is not better, too
+        }
+        Draft draft = best.draft;
+        draft.trellis = true;
+        draft.step *= TRELLIS_SHARE;
+        // Steps so fine come near the finest one of the trellis.
+        return draft.real64 || take(draft, TRELLIS_WEIGHT, best);
+    }
+};
+
+// The trial that takes the fewest bytes under a bound. `best` has the usual transform, or a given
+// one, which no other may replace.
+bool best_trial(const Scaled& scaled, int64_t most, Trial& best, fhash_error& error) {
+    const Task& task = scaled.task;
+    const bool given = task.quality.transform_given;
+    Trials trials(scaled, most, best, error);
+    Trial foretold = best;
+    if (!trials.take(trials.begin.draft, WEIGHT, best)) return false;
+    if (!given && task.half_range() / (2 * task.reach) < MAX_FORETOLD &&
+        !trials.predict(best, foretold))
+        return false;
+    const auto beats = [&](double factor) {
+        return foretold.bytes > 0 && factor * foretold.bytes <= best.bytes;
     };
-    const Trial begin = best;
-    for (size_t i = 0; i < specs.size(); i++) {
-        Trial trial = begin;
-        trial.draft.spec = specs[i];
-        if (!take_better(std::move(trial), i == 0)) return false;
+    if (!beats(FAR)) {
+        if (!given && !trials.transform(best, foretold)) return false;
+        if (!beats(CLOSE) && !trials.refine(best)) return false;
     }
-    if (!bounded) return true;
-    const Draft chosen = best.draft;
-    for (const double ratio : OTHER_RATIOS) {
-        Trial trial = begin;
-        trial.draft = chosen;
-        trial.draft.step = ratio * task.reach;
-        if (!take_better(std::move(trial), false)) return false;
-    }
-    if (best.draft.real64) return true;  // steps so fine come near the finest one of the trellis
-    Trial other = begin;
-    other.draft = best.draft;
-    other.draft.trellis = true;
-    other.draft.step *= TRELLIS_SHARE;
-    other.coding.weight = TRELLIS_WEIGHT;
-    return take_better(std::move(other), false);
+    if (beats(1)) best = std::move(foretold);
+    return true;
 }
 
 // Whether float32 would lose what the step keeps.
@@ -408,9 +375,9 @@ bool needs_real64(const Task& task, double step) {
            (span / step > 1 << 18 || (task.type != FHASH_FLOAT32 && largest / step > 1 << 20));
 }
 
-// The tile coded by transform; false without an error where that cannot be.
-bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, Coded& coded,
-                 fhash_error& error) {
+// The tile coded by transform or predictor; false without an error where that cannot be.
+bool transformed(const Task& task, Coded& coded, fhash_error& error) {
+    const int effort = task.quality.effort;
     const double given = task.quality.step;
     const double step = given > 0 ? given : FIRST_RATIO * task.reach;
     const bool too_fine = task.error >= 0 && task.reach < task.error / 2;
@@ -418,20 +385,24 @@ bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, C
                           task.half_range() / step < MAX_STEPS;
     if (too_fine || !in_range) return false;
     Trial trial;
-    trial.draft = {specs[0], step, task.center(), task.low, task.high,
-                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE,
-                   needs_real64(task, step), true, false, task.origin, task.whole_low,
-                   task.whole_high};
-    trial.coding = {WEIGHT, task.error, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
-    if (effort > 1 && !best_trial(task, specs, MAX_WINDOW << 2 * (effort - 2), trial, error))
-        return false;
-    const auto settings = trial.draft.settings(task.context, error);
+    trial.draft = {{}, step, typical(task), task.low, task.high,
+                   task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE, needs_real64(task, step),
+                   true, false, task.origin, task.whole_low, task.whole_high};
+    trial.coding = {WEIGHT, task.error, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
+    const Scaled scaled(task, trial.draft);
+    const int64_t most = effort > 1 ? TRIED << 2 * (effort - 2) : 0;
+    Form& form = trial.draft.form;
+    const bool bounded = task.error >= 0, priced = !bounded && !task.quality.transform_given;
+    if (task.quality.transform_given) std::copy_n(task.quality.transform, 4, form.axes);
+    else if (!plan(scaled, priced ? most : 0, priced, form, error)) return false;
+    if (bounded && effort > 1 && !best_trial(scaled, most, trial, error)) return false;
+    const auto settings = trial.draft.settings(task.context, task.shape, error);
     if (!settings) return false;
     const Norms norms = norms_of(task.context, settings->axes, task.shape);
     const double gain = *std::max_element(norms.tz.begin(), norms.tz.end()) *
                         *std::max_element(norms.yx.begin(), norms.yx.end());
-    if (task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
-    if (!trial.whole && !trial.run(task, task.values, task.marks, task.shape, error)) return false;
+    if (2 * task.half_range() / trial.draft.step * gain > MAX_STEPS) return false;
+    if (!trial.whole && !trial.run(task, error)) return false;
     coded = std::move(trial.coded);
     return true;
 }
@@ -440,10 +411,10 @@ bool transformed(const Task& task, const std::vector<Spec>& specs, int effort, C
 bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
               fhash_error& error) {
     const int64_t whole = origin.zero() ? 0 : (int64_t)center;
-    const Draft draft = {{{0, 0, 0, 0}}, 1.0, center, center, center, 0, true, false, false, origin,
+    const Draft draft = {{}, 1.0, center, center, center, 0, true, false, false, origin,
                          whole, whole};
-    const auto settings = draft.settings(task.context, error);
-    const fhash_coding coding = {0, -1, 0, 0, 1, 0, 1, 1, 1, 0};
+    const auto settings = draft.settings(task.context, task.shape, error);
+    const fhash_coding coding = {0, -1, 0, 1, 0, 1, 1, 1, 0};
     const std::vector<uint8_t> nothing((size_t)task.size(), 0);
     return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
                                    nothing.data(), task.marks, coding, coded, error);
@@ -491,8 +462,7 @@ template <class O> bool has_regions(const O* values, const Shape& shape) {
     return (double)equal / (double)n >= REGION_SHARE;
 }
 
-bool encode_task(const Task& task, const std::vector<Spec>& specs, int effort, Coded& coded,
-                 fhash_error& error) {
+bool encode_task(const Task& task, Coded& coded, fhash_error& error) {
     bool done;
     if (!encode_constant(task, coded, done, error)) return false;
     if (done) return true;
@@ -513,7 +483,7 @@ bool encode_task(const Task& task, const std::vector<Spec>& specs, int effort, C
             }
         }
     }
-    const bool has_other = transformed(task, specs, effort, other, error);
+    const bool has_other = transformed(task, other, error);
     if (!has_other && error.status != FHASH_OK) return false;
     const auto small = [&](bool there, const Coded& one) {
         return there && 2 * one.data.size() < task.bytes();
@@ -578,12 +548,7 @@ bool encode_quality(fhash_context& context, const fhash_tile* tile, const void* 
     if (!kept) return exactly(task, coded, error);
     if (!any) return constant(task, 0.0, {}, coded, error);
     set_bound(task);
-    std::vector<Spec> specs = candidates(task.shape);
-    if (quality->transform_given) {
-        specs.resize(1);
-        std::copy_n(quality->transform, 4, specs[0].axes);
-    }
-    return encode_task(task, specs, quality->effort, coded, error);
+    return encode_task(task, coded, error);
 }
 
 }  // namespace fhash

@@ -17,13 +17,6 @@ constexpr double MAX_PREDICTED = 1 << 27;
 
 using Mask = std::vector<uint8_t>;  // a byte for each vertex; empty where all count
 
-void put_leb(Buffer& out, uint64_t number) {
-    do {
-        out.push_back((uint8_t)((number & 127) | (number > 127 ? 128 : 0)));
-        number >>= 7;
-    } while (number);
-}
-
 // Bytes of values: those of equal weight together, lowest first, deflated.
 bool pack_planes(const void* values, int64_t n, size_t width, Buffer& out, fhash_error& error) {
     Buffer planes((size_t)n * width);
@@ -269,23 +262,16 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
     const double few = FEW * (double)n;
     double shifts[OFFSET_COUNT];
     for (int i = 0; i < OFFSET_COUNT; i++)
-        shifts[i] = (coding.rough ? PLAIN_OFFSETS[i] : settings.offsets[i]) / OFFSET_UNIT;
-    const double share = coding.rough && settings.trellis ? TRELLIS_SHARE : 1.0;
-    const double step = settings.step / share;
+        shifts[i] = settings.offsets[i] / OFFSET_UNIT;
+    const double step = settings.step;
     std::vector<int32_t> integers;
     std::vector<T> rebuilt, dequantised;
-    std::vector<float> scaled;
     make_room(integers, (size_t)n);
     make_room(rebuilt, (size_t)n);
     make_room(dequantised, (size_t)n);
-    make_room(scaled, (size_t)n);
     for (int round = 0; round < coding.rounds && (double)free > few; round++) {
-        if (coding.rough) {
-            quantise(coefficients.data(), n, 1.0 / step, ROUNDING, LARGEST, integers.data(),
-                     scaled.data());
-        } else if (!choose_integers(search, coefficients, coding.weight, 1, integers, error)) {
+        if (!choose_integers(search, coefficients, coding.weight, 1, integers, error))
             return error.status == FHASH_OK;
-        }
         dequantise(integers.data(), n, step, shifts, dequantised.data());
         if (!kernel_done(search.inverse->invert(dequantised.data(), rebuilt.data()), "a transform",
                          error))
@@ -446,6 +432,13 @@ bool encode_about_origin(Task& task, const uint8_t* in_coreset, Coded& coded, fh
 }
 
 }  // namespace
+
+void put_leb(Buffer& out, uint64_t number) {
+    do {
+        out.push_back((uint8_t)((number & 127) | (number > 127 ? 128 : 0)));
+        number >>= 7;
+    } while (number);
+}
 
 bool encode_predicted(const Predictor& predictor, const Shape& shape, const uint8_t* counted,
                       std::vector<int32_t>& integers, Buffer& out, fhash_error& error) {

@@ -130,7 +130,6 @@ typedef struct fhash_coding {
     double weight;        /* squared steps that a bit is worth in rate-distortion optimisation; 0 for none */
     double error;         /* bound on |decoded - value|; below 0 for none. A tile that cannot keep it is exact */
     int32_t rounds;       /* how often values that are free to change are replaced by their decoded ones */
-    int32_t rough;        /* 1: by those of the nearest integers, not of the chosen ones */
     int32_t passes;       /* 1, or 2: what was chosen is coded or searched once more */
     int32_t filled;       /* 1: values that do not count are a good filling already */
     int32_t density;      /* how thoroughly a filling is searched: 0, 1, 2, 4 or 8 thresholds per factor of two */

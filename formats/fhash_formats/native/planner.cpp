@@ -141,6 +141,9 @@ class Planner {
         return true;
     }
 
+    // The basis along an axis of tiles of a length, packed.
+    const Buffer& packed(size_t axis, int64_t length) { return own(axis, length).packed; }
+
   private:
     fhash_context& context_;
     const fhash_plan_task& task_;
@@ -150,6 +153,7 @@ class Planner {
     int64_t priced_ = 0, tried_ = 0;
     struct Own {
         std::shared_ptr<const Basis> basis;
+        Buffer packed;
         double bytes = 0;
     };
     std::map<std::pair<size_t, int64_t>, Modes> modes_;
@@ -246,8 +250,8 @@ class Planner {
         if (found != bases_.end()) return found->second;
         auto modes = modes_.find(key);
         if (modes == modes_.end()) modes = modes_.emplace(key, modes_along(axis, length)).first;
-        Buffer packed;
         Own& made = bases_[key];
+        Buffer& packed = made.packed;
         if (!pack_basis(modes->second, BASIS_STEPS * step_, packed, error_)) return none;
         made.basis = read_basis({packed.data(), packed.data() + packed.size()}, error_);
         made.bytes = BASIS_TEXT * (double)packed.size();
@@ -480,6 +484,7 @@ class Planner {
     // Looks for the step that keeps the promise, within what was too fine and too coarse before:
     // where few coefficients hold nearly everything, the error jumps at their step.
     bool settle(const Set& set, const Kinds& kinds) {
+        if (task_.size <= 0 && task_.mean_square <= 0) return true;
         double fine = -1e9, coarse = 1e9;
         for (int i = 0; i < MOST_SETTLED; i++) {
             Price found;
@@ -488,7 +493,7 @@ class Planner {
             if (task_.size > 0) {
                 wanted = std::log2(std::max(found.bytes, 1.0) / task_.size) / FALL;
             } else {
-                if (found.mean_square() <= 0 || task_.mean_square <= 0) return true;
+                if (found.mean_square() <= 0) return true;
                 wanted = -10 * std::log10(found.mean_square() / task_.mean_square) / SLOPE;
             }
             const double at = std::log(step_);
@@ -660,6 +665,16 @@ class Planner {
 };
 
 }  // namespace
+
+bool plan_tile(fhash_context& context, const fhash_plan_task& task, fhash_plan_result& result,
+               std::array<Buffer, 4>& bases, fhash_error& error) {
+    Planner planner(context, task, error);
+    if (!planner.run(result)) return false;
+    for (size_t a = 0; a < 4; a++)
+        if (result.kinds[a] == KLT_KIND) bases[a] = planner.packed(a, result.tile[a]);
+    return error.status == FHASH_OK;
+}
+
 }  // namespace fhash
 
 using namespace fhash;
@@ -668,7 +683,7 @@ using namespace fhash;
 FHASH_KERNEL int32_t fhash_plan(fhash_context* context, const fhash_plan_task* task,
                                 fhash_plan_result* result, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
-        Planner planner(*context, *task, failed);
-        return planner.run(*result) && failed.status == FHASH_OK;
+        std::array<Buffer, 4> bases;
+        return plan_tile(*context, *task, *result, bases, failed);
     });
 }

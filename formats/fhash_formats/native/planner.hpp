@@ -1,7 +1,9 @@
 // The planner: tiles, transform and step of a series by prices of some of its parts (planner.cpp).
 #pragma once
 
-#include "status.hpp"
+#include <array>
+
+#include "context.hpp"
 
 /* Parts of a series, all of one shape. Arrays are the caller's. */
 typedef struct fhash_plan_parts {
@@ -42,3 +44,12 @@ typedef struct fhash_plan_result {
     int64_t priced;              /* prices, for a report */
     int64_t tried;               /* tilings that were priced */
 } fhash_plan_result;
+
+namespace fhash {
+
+// Plans a series. bases: get the packed basis of each axis that has one of its own, fitted to the
+// lines of the task.
+bool plan_tile(fhash_context& context, const fhash_plan_task& task, fhash_plan_result& result,
+               std::array<Buffer, 4>& bases, fhash_error& error);
+
+}  // namespace fhash

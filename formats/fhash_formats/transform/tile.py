@@ -52,7 +52,6 @@ _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 
 _OPTIONS = (
     "rounds",
-    "rough",
     "passes",
     "filled",
     "density",
@@ -159,7 +158,6 @@ class Coding:
         error: bound on |decoded - value| at every counted value, in units of the values. It is kept
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
         rounds: how often the values that are free to change are replaced by their decoded values.
-        rough: whether these are those of the nearest integers, and not of those that are chosen.
         passes: 2 codes the integers that the optimisation chose once more, or searches the path
             through the trellis once more; 1 does not.
         filled: whether the values that are not counted are a good filling already, such as repeated
@@ -173,7 +171,6 @@ class Coding:
     weight: float = 0.0
     error: float | None = None
     rounds: int = 0
-    rough: bool = False
     passes: int = 1
     filled: bool = False
     density: int = 1

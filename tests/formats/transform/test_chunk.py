@@ -29,7 +29,7 @@ from fhash_formats.transform.spec import (
 )
 from fhash_formats.transform.stream import TILE_AXES, ArrayAxes, TransformCoder, take_axes
 from fhash_formats.transform.tile import Coding, decode_chunk, encode_chunk, encode_tile, tile_shape
-from fhash_formats.transform.tile_format import KIND, LABELS, TRANSFORMED, TileSettings
+from fhash_formats.transform.tile_format import KIND, LABELS, TileSettings
 
 FLOATS = ["f2", "f4", "f8", ">f4"]
 INTEGERS = ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", ">i2"]
@@ -249,7 +249,35 @@ def test_labels_without_loss_are_coded_as_labels(count: int, dtype: str, error: 
 
 @pytest.mark.parametrize(("dtype", "error"), [("i4", 1), ("f4", 0.5)])
 def test_a_looser_bound_codes_no_labels(dtype: str, error: float) -> None:
-    assert check(grains(60, dtype), error, max_error=error)[4] & KIND == TRANSFORMED
+    assert check(grains(60, dtype), error, max_error=error)[4] & KIND != LABELS
+
+
+SIZES = {
+    "wave": {0.01: 1958, 0.001: 5075},
+    "front": {0.01: 11475, 0.001: 25496},
+    "noise": {0.01: 24767, 0.001: 96456},
+}
+"""Bytes of each chunk at bounds that are shares of its range."""
+
+
+def chunk(kind: str) -> npt.NDArray[np.float32]:
+    """A generated chunk (t, z, y, x): a smooth wave, a front that moves, or noise."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (6, 12, 48, 48)), indexing="ij")
+    if kind == "wave":
+        values = np.sin(9 * x + 3 * t) * np.cos(7 * y - 2 * z) + 0.3 * np.sin(23 * x * y + z)
+    elif kind == "front":
+        values = np.tanh((np.hypot(x - 0.5, y - 0.4) - 0.15 - 0.3 * t) / 0.01 + np.sin(20 * z))
+    else:
+        values = np.sin(5 * x + t) + 0.02 * np.random.default_rng(1).normal(size=x.shape)
+    return values.astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_generated_chunks_take_the_bytes_that_they_took(kind: str) -> None:
+    values = chunk(kind)
+    for share, size in SIZES[kind].items():
+        error = share * float(np.ptp(values))
+        assert len(check(values, error, max_error=error)) < 1.03 * size
 
 
 def test_labels_keep_every_bit_of_floats() -> None:

@@ -144,7 +144,7 @@ void code(Reader& in, const fhash_tile& tile) {
     coding.weight = in.byte() / 256.0;
     coding.error = in.byte() & 1 ? -1 : std::abs(in.finite<double>());
     coding.rounds = in.byte() % 3;
-    for (std::int32_t* each : {&coding.rough, &coding.filled, &coding.keep_missing,
+    for (std::int32_t* each : {&coding.filled, &coding.keep_missing,
                                &coding.own_settings, &coding.fast})
         *each = in.byte() & 1;
     coding.passes = 1 + in.byte() % 2;
