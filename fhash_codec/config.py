@@ -186,8 +186,8 @@ class EncodeConfig(Record):
     )
     effort: int = limits(
         5,
-        "compact: 1 tries and trains nothing, 2 to 4 choose the transform by trial, "
-        "from 5 on a head is trained",
+        "compact: 1 prices few candidates and codes in one pass, 2 to 4 price more and weigh bits, "
+        "from 5 on a head is trained, the longer the higher",
         low=1,
         high=9,
         profile="compact",

@@ -237,7 +237,7 @@ over 1.5 GB took 10 of 33 seconds for 0.9 % of the bytes."""
 QUICK_EXCESS = 0.35
 """Excess in dB that is worth another pass at effort 1."""
 MARGIN = 0.005
-"""dB added to the PSNR in the second pass; doubled in each further one."""
+"""dB added to the PSNR in the second pass; four times as much in each further one."""
 UNLIKE = 0.3
 """dB by which all tiles may be worse than the sample before the gain of the head is looked at."""
 NEAR_MISS = 0.1
@@ -384,7 +384,7 @@ class _Aim:
 
     def next_target(self, psnr: float, attempt: int) -> float:
         """Return the PSNR to search for after an attempt that reached `psnr`."""
-        return self.min_psnr + MARGIN * float(2**attempt)
+        return self.min_psnr + MARGIN * float(4**attempt)
 
     def prefers(self, outcome: Outcome, other: Outcome) -> bool:
         """Whether an outcome keeps the promise in fewer bytes, or misses it by less."""

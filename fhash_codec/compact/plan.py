@@ -221,9 +221,11 @@ def _plan_of(task: PlanTask, attempt: Attempt, *, labels: bool) -> CodingPlan:
             attempt = replace(attempt, sample=tiles_of(task, attempt))
     filled = coding.density > 0 and attempt.sample.complete and blocks.dtype.kind == "f"
     small = prod(blocks.shape) * blocks.dtype.itemsize <= MAX_BYTES_KEPT
+    # Bases are fitted to it again where a finer step needs more precise ones.
+    own = coded or filled or blocks.in_memory
     return CodingPlan(
         blocks=blocks,
-        sample=attempt.sample if coded or filled else None,
+        sample=attempt.sample if own else None,
         settings=replace(attempt.settings, labels=True) if labels else attempt.settings,
         coding=task.goal.bounded(with_fill(coding) if filled else coding),
         goal=task.goal,

@@ -33,7 +33,7 @@ from fhash_codec.compact.attempt import (
 from fhash_codec.compact.goal import with_step
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Blocks, Index
-from fhash_codec.compact.transform import Bases, moved_transform, usual_transform
+from fhash_codec.compact.transform import Bases, about_center, moved_transform, usual_transform
 from fhash_codec.measure.value_range import Mean, ValueRange, mean_of
 from fhash_codec.progress import stage
 from fhash_formats.support.values import Single
@@ -240,21 +240,13 @@ class Priced:
         return TransformSpec(axes=(t, z, y, x))
 
 
-def _float32(values: npt.NDArray[Any], center: float) -> Single:
-    """Return finite values about a centre."""
-    about = np.ascontiguousarray(values, np.float32) - np.float32(center)
-    if not all_finite(about):
-        np.nan_to_num(about, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    return about
-
-
 def lines_along(values: npt.NDArray[Any], axis: int, center: float) -> Single:
     """Return lines along an axis of an array (t, z, y, x), spread evenly: (count, length)."""
     others = [length for number, length in enumerate(values.shape) if number != axis]
     count = prod(others)
     numbers = np.unique(np.linspace(0, count - 1, min(LINES, count)).astype(np.int64))
     places = np.unravel_index(numbers, others)
-    return np.ascontiguousarray(_float32(np.moveaxis(values, axis, -1)[places], center))
+    return np.ascontiguousarray(about_center(np.moveaxis(values, axis, -1)[places], center))
 
 
 class _Held:
@@ -270,7 +262,7 @@ class _Held:
 
     def parts(self, sample: Sample, center: float, vertices: int) -> _Parts:
         """Return the tiles of a sample as parts of a series of so many vertices."""
-        values = np.stack([_float32(tile.values, center) for tile in sample.tiles])
+        values = np.stack([about_center(tile.values, center) for tile in sample.tiles])
         counted = None
         if any(tile.counted is not None for tile in sample.tiles):
             masks = [
@@ -361,7 +353,7 @@ def by_prices(
         sheets = _parts(task, view, settings, sheet_of, larger)
     if len(tiles) > 1 and task.config.effort > 1:
         cut = view.retile(block_of(view.shape, BLOCK_VERTICES))
-        costs = part_costs(task, cut, settings.step)
+        costs = part_costs(task, cut, settings.step, settings.center)
         block = Sample(cut, 1, task.workers, costs, task.parts.tick)
 
     def filled(sample: Sample | None) -> Sample | None:
@@ -410,7 +402,7 @@ ROWS = 4
 """Distance in y of the rows that a part's cost is taken from."""
 
 
-def part_costs(task: PlanTask, blocks: Blocks, step: float) -> list[float] | None:
+def part_costs(task: PlanTask, blocks: Blocks, step: float, center: float) -> list[float] | None:
     """Return the approximate bits of each tile, by the differences of neighbours along x.
 
     Tiles where no vertex counts have none. None for a series that is not in memory.
@@ -422,7 +414,7 @@ def part_costs(task: PlanTask, blocks: Blocks, step: float) -> list[float] | Non
         tile = blocks.read(index)
         if tile.is_empty:
             return 0.0
-        values = tile.values[:, :, ::ROWS].astype(np.float32)
+        values = about_center(tile.values[:, :, ::ROWS], center)
         with np.errstate(all="ignore"):
             bits = np.log2(1 + np.abs(np.diff(values, axis=3)) * np.float32(1 / step))
         return float(np.nansum(bits, dtype=np.float64))
@@ -445,7 +437,7 @@ def _parts(
     shape, vertices = view.shape, round(larger * PRICED_VERTICES)
     one = prod(shape) <= vertices
     blocks = view.retile(shape if one else part_of(shape, round(larger * PART_VERTICES)))
-    costs = part_costs(task, blocks, settings.step)
+    costs = part_costs(task, blocks, settings.step, settings.center)
     vertices = max(vertices, prod(blocks.tile))
     return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
 

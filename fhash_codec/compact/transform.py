@@ -53,7 +53,7 @@ MAX_BASIS_LENGTH = 128
 """Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 
 
-BASIS_STEPS = 2.0
+BASIS_STEPS = 1.4
 """Quantiser steps that a basis is as precise as: of one, more bytes were lost than won."""
 
 
@@ -265,12 +265,23 @@ def magnitudes_of(values: npt.NDArray[Any], settings: TileSettings) -> Magnitude
     Only the kinds of the transform matter; float32 is precise enough.
     """
     kinds = replace(settings, double=False, step=1.0)
+    return magnitudes(forward(about_center(values, settings.center), kinds))
+
+
+def about_center(values: npt.NDArray[Any], center: float) -> npt.NDArray[np.float32]:
+    """Return values less a centre as float32, 0 where they are not finite.
+
+    Numbers of more digits than float32 has are subtracted first.
+    """
+    wide = values.dtype.itemsize > 2 and values.dtype != np.float32
+    working = np.dtype(np.float64 if wide else np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        single = values.astype(np.float32)
-        single -= np.float32(settings.center)
-    if not all_finite(single):
-        single[~np.isfinite(single)] = 0
-    return magnitudes(forward(single, kinds))
+        about: npt.NDArray[np.float32] = np.ascontiguousarray(
+            np.subtract(values, center, dtype=working, casting="unsafe"), dtype=np.float32
+        )
+    if not all_finite(about):
+        about[~np.isfinite(about)] = 0
+    return about
 
 
 def magnitudes_of_all(

@@ -28,12 +28,11 @@ from fhash_codec.compact.goal import (
     step_after,
     with_step,
 )
-from fhash_codec.compact.head import LEAST_GAIN, choose_head, training_pairs
+from fhash_codec.compact.head import LEAST_GAIN, LEAST_GAIN_OF_BOUND, choose_head, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
-from fhash_codec.compact.masks import with_mask
 from fhash_codec.compact.planner import QUICK_SHARE, block_of, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
-from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.sample import Sample, mask_levels
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
@@ -135,7 +134,7 @@ def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int)
     tiled = view.retile(found.tile)
     coding = coding_of(config.effort, filled=density == 0, density=density, bulk=goal.bulk)
     with stage("step", "coder and step, by coding some parts"):
-        parts = coded_parts(task, tiled, settings.step)
+        parts = coded_parts(task, tiled, settings)
         attempt = _coded(task, settings, coding, tiled, parts, found.size)
     task.gains.note("transform by trial", attempt.outcome)
     return replace(attempt, tiling=tiling)
@@ -157,7 +156,7 @@ def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
     filled = _planned(task, view, present.settings, task.density)
     shape = block_of(view.shape, COMPARED_VERTICES)
     cut = view.retile(shape)
-    costs = part_costs(task, cut, present.settings.step)
+    costs = part_costs(task, cut, present.settings.step, present.settings.center)
     assert costs is not None
     index = list(cut.indices())[int(np.argmax(costs))]
     t, z, y, x = (number * n for number, n in zip(index, shape, strict=True))
@@ -208,10 +207,10 @@ def _tried_filled(
     return best, least
 
 
-def coded_parts(task: PlanTask, tiled: Blocks, step: float) -> Sample:
+def coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
     """Return the parts of the tiles that are coded."""
     blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
-    costs = part_costs(task, blocks, step)
+    costs = part_costs(task, blocks, settings.step, settings.center)
     vertices = CODED_VERTICES if task.config.effort > 1 else round(QUICK_SHARE * CODED_VERTICES)
     return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
 
@@ -219,6 +218,17 @@ def coded_parts(task: PlanTask, tiled: Blocks, step: float) -> Sample:
 def with_fill(coding: Coding) -> Coding:
     """Return the coding of tiles that are filled already."""
     return replace(coding, filled=True, density=0)
+
+
+def with_mask(task: PlanTask, sample: Sample, settings: TileSettings, error: float) -> TileSettings:
+    """Return settings with scores for the mask of the vertices that count, if there is one.
+
+    error: root of the mean squared error of the decoded values, in data units.
+    """
+    if task.blocks.complete:
+        return settings
+    levels = mask_levels(task.features, task.config.dilation, error, sample.tiles)
+    return replace(settings, mask=levels)
 
 
 def _coded(
@@ -394,7 +404,7 @@ def tiles_of(task: PlanTask, attempt: Attempt) -> Sample:
     """Return all tiles of a plan, or many where a series is large, filled as they are coded."""
     blocks = task.blocks.retile(attempt.sample.blocks.tile)
     most = SEARCHED if prod(blocks.shape) <= SEARCHED else SAMPLED
-    costs = part_costs(task, blocks, attempt.settings.step)
+    costs = part_costs(task, blocks, attempt.settings.step, attempt.settings.center)
     sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
     return sample.filled(attempt.settings, attempt.coding.density)
 
@@ -417,8 +427,10 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
         pairs = training_pairs(attempt.parts, attempt.moved, coding)
         low, high = attempt.settings.low, attempt.settings.high
         gain = foretold_gain(pairs, low, high, task.config.seed)
-    # Who wishes for the fewest bytes pays the seconds of a training for little.
-    if gain < (0 if task.config.access == "small" else LEAST_GAIN):
+    # Who wishes for the fewest bytes pays the seconds of a training for little. Under a bound, the
+    # residual corrects most of what a head would.
+    least = LEAST_GAIN if task.goal.error is None else LEAST_GAIN_OF_BOUND
+    if gain < (0 if task.config.access == "small" else least):
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
     task.parts.begin("head")

@@ -505,12 +505,10 @@ def tiling_text(info: VolumeInfo) -> str:
     told = info["model"].get("tiling", {})
     text = ""
     if told.get("price") is not None:
-        best = told.get("best", info["model"]["levels"][0])
-        against = "one tile" if best == info["model"]["levels"][0] else f"tiles of {extent(best)}"
         more = told["price"] - 1
-        text = f", {more:.0%} above {against}" if more > 0 else ", the fewest bytes of all tried"
-        if not told.get("tried"):
-            text = f", at most about {more:.0%} above {against}" if more > 0 else ""
+        text = ", the fewest bytes of all priced"
+        if more > 0:
+            text = f", by price {more:.0%} above the fewest bytes"
     if told.get("coder"):
         text += f"; by the {told['coder']} coder"
     if told.get("region_ms") is not None:

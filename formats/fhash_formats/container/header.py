@@ -639,8 +639,6 @@ def _check_tiling(tiling: Record) -> None:
     """Check `model.tiling`, each of whose keys may be missing."""
     for key in ("price", "region_ms"):
         tiling.number_or_null(key)
-    if tiling.has("best"):
-        tiling.integers("best", 4, 1, MAX_LENGTH)
     if tiling.has("tried"):
         tiling.integer("tried", 0, MAX_LENGTH)
     if tiling.has("coder"):

@@ -18,7 +18,7 @@ namespace {
 
 constexpr double WEIGHT = 0.09;       // squared steps that a bit is worth
 constexpr double ERROR_PRICE = 0.8;   // squared error in squared steps that is worth a byte
-constexpr double BASIS_STEPS = 2;      // that a basis is as precise as
+constexpr double BASIS_STEPS = 1.4;      // that a basis is as precise as
 constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a packed basis
 constexpr double NEAR = 1.02;         // of the cheapest on few parts: then all parts are priced
 constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
@@ -641,7 +641,8 @@ class Planner {
         double bytes;
         if (!price_cuts(columns, sheets, kinds, cuts, bytes)) return false;
         Price whole;
-        std::map<Shape, double> checked = {{block.shape(), 1.0}};
+        std::map<Shape, double> checked;
+        if (!block.all.empty()) checked[block.shape()] = 1;
         for (bool only = false;; only = checked.size() > MOST_CHECKS) {
             least_burden(cuts, block.shape(), checked, only, bytes, tile, result.price);
             const Shape inside = within(block.shape(), tile);

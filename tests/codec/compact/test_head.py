@@ -54,7 +54,7 @@ from fhash_codec.compact.transform import (
     refit,
     usual_transform,
 )
-from fhash_codec.paper.table_transform import choose_transform
+from fhash_codec.paper.table_step import choose_transform
 from fhash_codec.progress import Parts
 from fhash_formats.transform.head import CROSS, INPUTS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec

@@ -41,10 +41,9 @@ from fhash_codec.compact.goal import (
 )
 from fhash_codec.compact.head import EFFORTS, Budget
 from fhash_codec.compact.labels import holds_beside, rank_share
-from fhash_codec.compact.masks import mask_levels
 from fhash_codec.compact.plan import CodingPlan, first_settings, plan
 from fhash_codec.compact.predictor import IntegerTile, fit_weights
-from fhash_codec.compact.sample import FEW_TILES, Sample
+from fhash_codec.compact.sample import FEW_TILES, Sample, mask_levels
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, off_trellis, on_trellis
 from fhash_codec.compact.transform import usual_transform
 from fhash_codec.features.features import dilate, parse_feature
