@@ -144,8 +144,6 @@ COMPARED_VERTICES = 5 << 18
 """Vertices of the block on which plans are compared: of half as many, bases are not worth it."""
 TRIAL_DENSITY = 2
 """Thoroughness of filling there: more of it changed no choice."""
-CLEARLY = 0.99
-"""Share of the bytes below which another transform is taken there."""
 
 
 def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
@@ -201,7 +199,7 @@ def _tried_filled(
         settings = replace(attempt.settings, transform=TransformSpec(axes=axes))
         outcome = sample.run(moved_transform(sample, settings), coding)
         size = _at_promise(outcome, task.goal)
-        if size < (CLEARLY if best is attempt else 1.0) * least:
+        if size < least:
             step = step_after(settings, outcome, task.goal)
             best, least = replace(attempt, settings=with_step(settings, step, task.goal)), size
     return best, least
