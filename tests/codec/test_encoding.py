@@ -70,7 +70,7 @@ def opened(path: Path) -> Dataset:
 
 
 def test_every_variable_of_a_file_keeps_its_promise(tmp_path: Path, source: Path) -> None:
-    bounds = {"u": 0.1, "v": 0.01, "z": 0.001}
+    bounds = {"u": 0.1, "v": 0.01, "z": 0.0001}
     configs = {n: EncodeConfig(effort=1, max_error=bound) for n, bound in bounds.items()}
     path = tmp_path / "run.fhz"
     report = fhash_codec.encode_dataset(source, path, configs)

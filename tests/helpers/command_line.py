@@ -73,7 +73,7 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A container of part of the tiny series, with vertices outside the coreset."""
     path = tmp_path_factory.mktemp("run") / "tiny.fhz"
     result = invoke(
-        "encode", data, "-o", path, "--feature", "interval:6:99", "--dilation", "0", *SMALL
+        "encode", data, "-o", path, "--feature", "interval:4:99", "--dilation", "0", *SMALL
     )
     assert result.exit_code == 0, result.stderr
     return path

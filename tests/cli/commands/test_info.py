@@ -133,7 +133,7 @@ def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
         "3 x 6 x 7 x 8",
         "time 0 to 4",
         "x 10 to 3",
-        "interval:6:99",
+        "interval:4:99",
         "compact",
     ):
         assert text in result.stdout
