@@ -680,7 +680,7 @@ def _step_for_bound(
     # Rounded up: with a head, a smaller step could need float64.
     number = math.ceil(STEPS_TO_OCTAVE * math.log2(plain / error) - 1e-6)
     start = min(max(number, 0), MAX_STEP_NUMBER)
-    return cheapest(run, start, MAX_STEP_NUMBER, strides=(2, 1))
+    return cheapest(run, start, MAX_STEP_NUMBER, strides=(5, 2, 1))
 
 
 def _step_for_size(

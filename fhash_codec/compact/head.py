@@ -73,8 +73,6 @@ At 5 a cross is left out: it gains up to a fifth more, and takes six times as lo
 """
 LEAST_GAIN = 0.1
 """Gain in dB of least squares below which no head is trained."""
-LEAST_GAIN_OF_BOUND = 0.2
-"""The same under a strict bound: 0.1 dB saved 0.03 % of the bytes."""
 GAIN_OF_HEAD = 1.6
 """Gain of a head as a multiple of that of least squares: 1.6 to 1.9 on three series."""
 MAX_OF_TRIAL = 1.5

@@ -28,7 +28,7 @@ from fhash_codec.compact.goal import (
     step_after,
     with_step,
 )
-from fhash_codec.compact.head import LEAST_GAIN, LEAST_GAIN_OF_BOUND, choose_head, training_pairs
+from fhash_codec.compact.head import LEAST_GAIN, choose_head, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
 from fhash_codec.compact.planner import QUICK_SHARE, block_of, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
@@ -253,15 +253,10 @@ def _coded(
     slow = task.is_slow(tiled.tile, size)
     if slow and task.config.effort == 1:
         coding = replace(coding, fast=True)
-    outcome = parts.run(moved, goal.bounded(with_fill(coding)))
     if slow and not coding.fast:
-        faster = replace(coding, fast=True)
-        other = parts.run(moved, goal.bounded(with_fill(faster)))
-        ratio = _at_promise(other, goal) / max(_at_promise(outcome, goal), 1.0)
-        most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
-        tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
-        if ratio <= most:
-            coding, outcome = faster, other
+        coding, outcome = _with_coder(task, moved, coding, parts, size)
+    else:
+        outcome = parts.run(moved, goal.bounded(with_fill(coding)))
     if goal.data_range <= 0:
         pass  # any step gives the one value that there is
     elif goal.psnr is not None:
@@ -282,6 +277,23 @@ def _coded(
         parts=parts,
         moved=moved,
     )
+
+
+def _with_coder(
+    task: PlanTask, moved: TileSettings, coding: Coding, parts: Sample, size: float
+) -> tuple[Coding, Outcome]:
+    """Return the coding by the fast coder where it takes few enough bytes, and its outcome.
+
+    moved: settings of the parts, which are coded.
+    coding: by the other coder.
+    size: bytes of all tiles, approximately.
+    """
+    goal, faster = task.goal, replace(coding, fast=True)
+    slow, fast = (parts.run(moved, goal.bounded(with_fill(each))) for each in (coding, faster))
+    ratio = _at_promise(fast, goal) / max(_at_promise(slow, goal), 1.0)
+    most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
+    tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
+    return (faster, fast) if ratio <= most else (coding, slow)
 
 
 def _promised_step(
@@ -425,10 +437,8 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
         pairs = training_pairs(attempt.parts, attempt.moved, coding)
         low, high = attempt.settings.low, attempt.settings.high
         gain = foretold_gain(pairs, low, high, task.config.seed)
-    # Who wishes for the fewest bytes pays the seconds of a training for little. Under a bound, the
-    # residual corrects most of what a head would.
-    least = LEAST_GAIN if task.goal.error is None else LEAST_GAIN_OF_BOUND
-    if gain < (0 if task.config.access == "small" else least):
+    # Who wishes for the fewest bytes pays the seconds of a training for little.
+    if gain < (0 if task.config.access == "small" else LEAST_GAIN):
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
     task.parts.begin("head")
