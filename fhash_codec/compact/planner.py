@@ -33,7 +33,13 @@ from fhash_codec.compact.attempt import (
 from fhash_codec.compact.goal import with_step
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Blocks, Index
-from fhash_codec.compact.transform import Bases, about_center, moved_transform, usual_transform
+from fhash_codec.compact.transform import (
+    Bases,
+    about_center,
+    moved_transform,
+    scale_of,
+    usual_transform,
+)
 from fhash_codec.measure.value_range import Mean, ValueRange, mean_of
 from fhash_codec.progress import stage
 from fhash_formats.support.values import Single
@@ -240,13 +246,13 @@ class Priced:
         return TransformSpec(axes=(t, z, y, x))
 
 
-def lines_along(values: npt.NDArray[Any], axis: int, center: float) -> Single:
+def lines_along(values: npt.NDArray[Any], axis: int, settings: TileSettings) -> Single:
     """Return lines along an axis of an array (t, z, y, x), spread evenly: (count, length)."""
     others = [length for number, length in enumerate(values.shape) if number != axis]
     count = prod(others)
     numbers = np.unique(np.linspace(0, count - 1, min(LINES, count)).astype(np.int64))
     places = np.unravel_index(numbers, others)
-    return np.ascontiguousarray(about_center(np.moveaxis(values, axis, -1)[places], center))
+    return np.ascontiguousarray(about_center(np.moveaxis(values, axis, -1)[places], settings))
 
 
 class _Held:
@@ -260,9 +266,9 @@ class _Held:
         self._arrays.append(array)
         return array.ctypes.data
 
-    def parts(self, sample: Sample, center: float, vertices: int) -> _Parts:
+    def parts(self, sample: Sample, settings: TileSettings, vertices: int) -> _Parts:
         """Return the tiles of a sample as parts of a series of so many vertices."""
-        values = np.stack([about_center(tile.values, center) for tile in sample.tiles])
+        values = np.stack([about_center(tile.values, settings) for tile in sample.tiles])
         counted = None
         if any(tile.counted is not None for tile in sample.tiles):
             masks = [
@@ -295,11 +301,11 @@ def priced_plan(
     tiles: candidates.
     """
     config, goal, blocks = task.config, task.goal, task.blocks
-    held = _Held()
+    held, scale = _Held(), scale_of(settings)
     first, more = DECODING_NS["fast"]
     given = _Task(
         shape=(ctypes.c_int64 * 4)(*blocks.shape),
-        columns=held.parts(columns, settings.center, prod(blocks.shape)),
+        columns=held.parts(columns, settings, prod(blocks.shape)),
         tiles=held.address(np.array(tiles, np.int64)),
         works=held.address(np.array([region_vertices(blocks.shape, tile) for tile in tiles])),
         tile_count=len(tiles),
@@ -308,18 +314,18 @@ def priced_plan(
         vertex_ns=TRANSFORM_NS + first,
         bit_ns=more,
         most=max(PRICES[config.access] - DOUBT, 1.0),
-        step=settings.step,
-        mean_square=goal.expected_error**2 if goal.psnr is not None else 0.0,
+        step=settings.step * scale,
+        mean_square=(goal.expected_error * scale) ** 2 if goal.psnr is not None else 0.0,
         size=0.0 if goal.size is None else max(goal.size - goal.overhead, 1.0),
     )
     if sheets is not None:
-        given.sheets = held.parts(sheets, settings.center, prod(blocks.shape))
+        given.sheets = held.parts(sheets, settings, prod(blocks.shape))
     if block is not None:
-        given.block = held.parts(block, settings.center, prod(blocks.shape))
+        given.block = held.parts(block, settings, prod(blocks.shape))
     for axis, length in enumerate(blocks.shape):
         if blocks.in_memory and length > 1:
             whole = blocks.values_in_memory
-            lines = lines_along(whole, axis, settings.center)
+            lines = lines_along(whole, axis, settings)
             given.lines[axis], given.line_counts[axis] = held.address(lines), len(lines)
     found = _Result()
     call_with_context("fhash_plan", ctypes.byref(given), ctypes.byref(found))
@@ -329,7 +335,7 @@ def priced_plan(
         axes=tuple(
             (KINDS[kind], depth) for kind, depth in zip(found.kinds, found.depths, strict=True)
         ),
-        step=found.step,
+        step=found.step / scale,
         size=found.bytes,
         price=found.price,
         tried=found.tried,
@@ -353,7 +359,7 @@ def by_prices(
         sheets = _parts(task, view, settings, sheet_of, larger)
     if len(tiles) > 1 and task.config.effort > 1:
         cut = view.retile(block_of(view.shape, BLOCK_VERTICES))
-        costs = part_costs(task, cut, settings.step, settings.center)
+        costs = part_costs(task, cut, settings)
         block = Sample(cut, 1, task.workers, costs, task.parts.tick)
 
     def filled(sample: Sample | None) -> Sample | None:
@@ -402,7 +408,7 @@ ROWS = 4
 """Distance in y of the rows that a part's cost is taken from."""
 
 
-def part_costs(task: PlanTask, blocks: Blocks, step: float, center: float) -> list[float] | None:
+def part_costs(task: PlanTask, blocks: Blocks, settings: TileSettings) -> list[float] | None:
     """Return the approximate bits of each tile, by the differences of neighbours along x.
 
     Tiles where no vertex counts have none. None for a series that is not in memory.
@@ -410,11 +416,13 @@ def part_costs(task: PlanTask, blocks: Blocks, step: float, center: float) -> li
     if not blocks.in_memory:
         return None
 
+    step = settings.step * scale_of(settings)
+
     def cost(index: Index) -> float:
         tile = blocks.read(index)
         if tile.is_empty:
             return 0.0
-        values = about_center(tile.values[:, :, ::ROWS], center)
+        values = about_center(tile.values[:, :, ::ROWS], settings)
         with np.errstate(all="ignore"):
             bits = np.log2(1 + np.abs(np.diff(values, axis=3)) * np.float32(1 / step))
         return float(np.nansum(bits, dtype=np.float64))
@@ -437,7 +445,7 @@ def _parts(
     shape, vertices = view.shape, round(larger * PRICED_VERTICES)
     one = prod(shape) <= vertices
     blocks = view.retile(shape if one else part_of(shape, round(larger * PART_VERTICES)))
-    costs = part_costs(task, blocks, settings.step, settings.center)
+    costs = part_costs(task, blocks, settings)
     vertices = max(vertices, prod(blocks.tile))
     return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.compact.tiles import Blocks, Tile
 from fhash_codec.measure.errors import pointer
+from fhash_codec.measure.value_range import power_of_two
 from fhash_codec.progress import stage
 from fhash_formats.transform.spec import (
     MAX_LENGTH,
@@ -260,25 +261,36 @@ def squared_error(vertices: int, psnr: float, data_range: float) -> float:
 
 
 def magnitudes_of(values: npt.NDArray[Any], settings: TileSettings) -> Magnitudes:
-    """Return the magnitudes of the coefficients of a tile (t, z, y, x).
+    """Return the magnitudes of the coefficients of a tile (t, z, y, x), times `scale_of`.
 
     Only the kinds of the transform matter; float32 is precise enough.
     """
     kinds = replace(settings, double=False, step=1.0)
-    return magnitudes(forward(about_center(values, settings.center), kinds))
+    return magnitudes(forward(about_center(values, settings), kinds))
 
 
-def about_center(values: npt.NDArray[Any], center: float) -> npt.NDArray[np.float32]:
-    """Return values less a centre as float32, 0 where they are not finite.
+def scale_of(settings: TileSettings) -> float:
+    """Return the power of two that makes float32 hold the range of the values, however wide."""
+    return power_of_two(settings.high - settings.low)
+
+
+USUAL_SCALES = 2.0**-60, 2.0**60
+"""Scales within which float32 itself holds values less their centre."""
+
+
+def about_center(values: npt.NDArray[Any], settings: TileSettings) -> npt.NDArray[np.float32]:
+    """Return values less the centre, times `scale_of`, as float32; 0 where they are not finite.
 
     Numbers of more digits than float32 has are subtracted first.
     """
+    scale = scale_of(settings)
     wide = values.dtype.itemsize > 2 and values.dtype != np.float32
+    wide |= not USUAL_SCALES[0] < scale < USUAL_SCALES[1]
     working = np.dtype(np.float64 if wide else np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        about: npt.NDArray[np.float32] = np.ascontiguousarray(
-            np.subtract(values, center, dtype=working, casting="unsafe"), dtype=np.float32
-        )
+        less = np.subtract(values, settings.center, dtype=working, casting="unsafe")
+        less *= working.type(scale)
+        about: npt.NDArray[np.float32] = np.ascontiguousarray(less, dtype=np.float32)
     if not all_finite(about):
         about[~np.isfinite(about)] = 0
     return about

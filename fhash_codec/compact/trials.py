@@ -50,6 +50,7 @@ from fhash_codec.compact.transform import (
     magnitudes_of_all,
     moved_transform,
     refit,
+    scale_of,
     squared_error,
     weighted,
 )
@@ -154,7 +155,7 @@ def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
     filled = _planned(task, view, present.settings, task.density)
     shape = block_of(view.shape, COMPARED_VERTICES)
     cut = view.retile(shape)
-    costs = part_costs(task, cut, present.settings.step, present.settings.center)
+    costs = part_costs(task, cut, present.settings)
     assert costs is not None
     index = list(cut.indices())[int(np.argmax(costs))]
     t, z, y, x = (number * n for number, n in zip(index, shape, strict=True))
@@ -208,7 +209,7 @@ def _tried_filled(
 def coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
     """Return the parts of the tiles that are coded."""
     blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
-    costs = part_costs(task, blocks, settings.step, settings.center)
+    costs = part_costs(task, blocks, settings)
     vertices = CODED_VERTICES if task.config.effort > 1 else round(QUICK_SHARE * CODED_VERTICES)
     return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
 
@@ -382,17 +383,22 @@ def _step(
     if tiled.complete:
         series = magnitudes_of_all(tiled, settings, task.workers)
         count = sum(tiled.weights) * prod(tiled.shape)
-    foretold = few.error(settings.step)
-    least = goal.data_range * MIN_STEP_SHARE
+    scale = scale_of(settings)
+    foretold = few.error(settings.step * scale)
+    least = goal.data_range * scale * MIN_STEP_SHARE
+
+    def step_for(error: float) -> float:
+        return series.step(error, least) / scale
+
     if not (foretold > 0 and outcome.squares > 0):
-        even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range)
-        return series.step(even, least)
+        even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range * scale)
+        return step_for(even)
     error = squared_error(count, goal.psnr + AIM, goal.data_range)
-    step = series.step(error * foretold / outcome.squares, least)
+    step = step_for(error * (foretold / outcome.squares))
     if outcome.bulk_squares == 0:
         return step
     error *= outcome.bulk_count / max(outcome.count, 1)
-    return min(step, series.step(error * foretold / outcome.bulk_squares, least))
+    return min(step, step_for(error * (foretold / outcome.bulk_squares)))
 
 
 SEARCHED = 12 << 20
@@ -414,7 +420,7 @@ def tiles_of(task: PlanTask, attempt: Attempt) -> Sample:
     """Return all tiles of a plan, or many where a series is large, filled as they are coded."""
     blocks = task.blocks.retile(attempt.sample.blocks.tile)
     most = SEARCHED if prod(blocks.shape) <= SEARCHED else SAMPLED
-    costs = part_costs(task, blocks, attempt.settings.step, attempt.settings.center)
+    costs = part_costs(task, blocks, attempt.settings)
     sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
     return sample.filled(attempt.settings, attempt.coding.density)
 
