@@ -412,8 +412,8 @@ class Attempt:
     """Outcome of the sample with these settings."""
     coding: Coding
     """Options of the encoder, without the bound."""
-    tried: list[Outcome] = field(default_factory=list)
-    """Outcome of all tiles, or of many, without a head; empty where none were coded."""
+    coded: bool = False
+    """Whether the outcome is that of all tiles, or of many where a series is large."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head."""
     tiling: Tiling | None = None

@@ -20,6 +20,7 @@ from fhash_codec.compact.attempt import (
 )
 from fhash_codec.compact.goal import Goal, integer_goal, with_step
 from fhash_codec.compact.labels import (
+    LOOK_VERTICES,
     LabelTrial,
     ends_trials,
     has_labels,
@@ -145,10 +146,6 @@ def _may_be_exact(task: PlanTask, found: CodingPlan) -> bool:
     return is_nearly_exact(task) and found.size is not None and not found.settings.labels
 
 
-LOOK_VERTICES = 1 << 18
-"""Vertices of the tiles whose mean is the first centre."""
-
-
 def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
     """Return settings to begin with: the usual transform, a centre, a guessed step."""
     goal, value_range = task.goal, task.value_range
@@ -215,8 +212,8 @@ def _plan_of(task: PlanTask, attempt: Attempt, *, labels: bool) -> CodingPlan:
     integers are not used again: rounded ones would cost more than those they were rounded from.
     """
     blocks, coding = task.blocks.retile(attempt.sample.blocks.tile), attempt.coding
-    coded = attempt.sample.complete and bool(attempt.tried)
-    if coding.density and not attempt.tried and prod(blocks.shape) <= SEARCHED:
+    coded = attempt.sample.complete and attempt.coded
+    if coding.density and not attempt.coded and prod(blocks.shape) <= SEARCHED:
         with stage("filling", "all tiles, once for all steps of the quantiser"):
             attempt = replace(attempt, sample=tiles_of(task, attempt))
     filled = coding.density > 0 and attempt.sample.complete and blocks.dtype.kind == "f"

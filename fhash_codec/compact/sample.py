@@ -208,11 +208,6 @@ class Sample:
         """Settings and density by which the tiles were filled; None for tiles of the source."""
         return self._filling
 
-    @property
-    def is_single(self) -> bool:
-        """Whether this is one tile of several, which may be unlike the others."""
-        return len(self.tiles) == 1 and not self.complete
-
     def wider(self, max_vertices: int) -> Sample:
         """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.
 

@@ -409,11 +409,11 @@ SAMPLED = 6 << 20
 
 def on_all_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     """Return a plan whose outcome is that of all tiles, or of many where a series is large."""
-    if attempt.tried:
+    if attempt.coded:
         return attempt
     sample, coding = tiles_of(task, attempt), attempt.coding
     outcome = sample.run(attempt.settings, task.goal.bounded(with_fill(coding)))
-    return replace(attempt, sample=sample, outcome=outcome, tried=[outcome])
+    return replace(attempt, sample=sample, outcome=outcome, coded=True)
 
 
 def tiles_of(task: PlanTask, attempt: Attempt) -> Sample:
@@ -494,11 +494,13 @@ WITH_HEAD = 0.6
 
 def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
     """Return the plan with a head, or with a predictor under a strict bound, if that is smaller."""
-    predicted = _predicted(task, attempt)
-    if predicted is None:
+    settings = _predictor_of(task, attempt)
+    if settings is None:
         return with_head(task, attempt)
     attempt = on_all_tiles(task, attempt)
-    size = predicted.outcome.size
+    coding = task.goal.bounded(with_fill(attempt.coding))
+    outcome = attempt.sample.run(settings, coding)
+    predicted, size = replace(attempt, settings=settings, outcome=outcome), outcome.size
     if size >= WITH_HEAD * attempt.outcome.size:
         attempt = with_head(task, attempt)
     else:
@@ -506,12 +508,12 @@ def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
     # What is predicted is read slowly: no reason to give up the fast coder for little.
     share = FAST_BYTES[task.config.access] if attempt.coding.fast else 1.0
     kept = size * share < attempt.outcome.size
-    task.gains.note("prediction" if kept else "prediction (left out)", predicted.outcome)
+    task.gains.note("prediction" if kept else "prediction (left out)", outcome)
     return predicted if kept else attempt
 
 
-def _predicted(task: PlanTask, attempt: Attempt) -> Attempt | None:
-    """Return the plan of all tiles with a predictor where some parts take fewer bytes by it."""
+def _predictor_of(task: PlanTask, attempt: Attempt) -> TileSettings | None:
+    """Return settings with a predictor where some parts take fewer bytes by it."""
     goal, effort = task.goal, task.config.effort
     if not goal.error or goal.data_range <= 0:
         skip("predictor", "only a bound on each error has use for it")
@@ -528,10 +530,6 @@ def _predicted(task: PlanTask, attempt: Attempt) -> Attempt | None:
             error=goal.error,
             effort=effort,
         )
-    if settings is None:
-        return None
-    if settings.trellis:
+    if settings is not None and settings.trellis:
         settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients now
-    sample, coding = tiles_of(task, attempt), goal.bounded(with_fill(attempt.coding))
-    outcome = sample.run(settings, coding)
-    return replace(attempt, sample=sample, settings=settings, outcome=outcome, tried=[outcome])
+    return settings
