@@ -14,6 +14,7 @@ from typing import Any
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
+from fhash_codec.compact.transform import Magnitudes
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
 from fhash_codec.measure.value_range import ValueRange
@@ -422,3 +423,5 @@ class Attempt:
     """Parts of the tiles that were coded."""
     moved: TileSettings | None = None
     """Settings of these parts."""
+    magnitudes: Magnitudes | None = None
+    """Of the coefficients of all tiles, or of these parts; None without a promised PSNR."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from fhash_codec.compact.attempt import HeadHistory, region_vertices
+from fhash_codec.compact.attempt import HeadHistory
 from fhash_codec.compact.goal import (
     EXCHANGE,
     FINEST_PSNR,
@@ -61,7 +61,6 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.series import Series
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.transform.tile import decode_tile
 from fhash_formats.transform.values import at_origin
 
 DecodedTiles = Mapping[Index, npt.NDArray[Any]]
@@ -122,16 +121,12 @@ def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
     }
 
 
-def tiling_header(table: CodedTable, *, timings: bool, quick: bool) -> dict[str, Any] | None:
+def tiling_header(table: CodedTable) -> dict[str, Any] | None:
     """Return what a header says of the tiles; None where there is nothing to say.
 
-    Keys: `price`, bytes as a multiple of those of the best tiling; `best`, the tile of that one;
-    `tried`, the number of tilings that were coded, 0 where the price is foretold; `region_ms`, see
-    `measure_region`; `coder`, "fast" where the tiles are of the fast coder. Tiles that were asked
-    for have these two alone.
-
-    timings: whether times may be told.
-    quick: whether there is no time to measure one.
+    Keys: `price`, bytes as a multiple of those of the best tiling; `tried`, the number of tilings
+    that were priced, 0 where the price is foretold; `coder`, "fast" where the tiles are of the fast
+    coder. Tiles that were asked for have the last one alone.
     """
     record: dict[str, Any] = {}
     tiling = table.plan.tiling
@@ -142,23 +137,7 @@ def tiling_header(table: CodedTable, *, timings: bool, quick: bool) -> dict[str,
         }
     if table.plan.coding.fast:
         record["coder"] = "fast"
-    if timings and not quick:
-        record["region_ms"] = round(1000 * measure_region(table), 2)
     return record or None
-
-
-def measure_region(table: CodedTable) -> float:
-    """Return the seconds in which a region of 16^3 vertices of a step is decoded, in the mean.
-
-    The tile of the median size is decoded on one thread. The rest of an access (the opening of the
-    file, the read from a disk) is not in it.
-    """
-    blocks = table.plan.blocks
-    stream = sorted(table.streams, key=len)[len(table.streams) // 2]
-    begun = time.perf_counter()
-    decode_tile(stream, blocks.tile, blocks.dtype, table.plan.settings)
-    seconds = time.perf_counter() - begun
-    return seconds * region_vertices(blocks.shape, blocks.tile) / prod(blocks.tile)
 
 
 SIZE_PASSES = 10
@@ -650,7 +629,7 @@ def table_header(
     """
     extent = selection.extent
     trained = table.plan.history
-    tiling = tiling_header(table, timings=config.timings, quick=config.effort == 1)
+    tiling = tiling_header(table)
     return {
         "encoder": {
             "version": version("fhash"),

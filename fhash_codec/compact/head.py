@@ -10,7 +10,7 @@ from threading import Event
 from typing import NamedTuple
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
-from fhash_codec.compact.goal import EXCHANGE, STEP_AIM, step_after_gain
+from fhash_codec.compact.goal import EXCHANGE, find_step, step_after_gain
 from fhash_codec.compact.head_training import (
     Budget,
     Pair,
@@ -19,9 +19,12 @@ from fhash_codec.compact.head_training import (
     train_head,
 )
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Coding, Outcome
+from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, measured, total
+from fhash_codec.compact.transform import scale_of
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.support.threads import at_most, usable_threads
+from fhash_formats.transform.head import NeighbourHead
+from fhash_formats.transform.tile import CodedTile
 from fhash_formats.transform.tile_format import TileSettings
 
 PERCEPTRON = Shape((12, 8), cross=False)
@@ -79,6 +82,8 @@ MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
 """Such multiples that nearly all gains of perceptrons lie between."""
+AIM = 0.02
+"""dB above the promise that the step with a head is for."""
 AT_ONCE = 2
 """Heads that are trained side by side, at most."""
 WEIGHT_BYTES = 0.7
@@ -123,160 +128,126 @@ def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
     return size * share - WEIGHT_BYTES * shape.weights - HEAD_BYTES
 
 
-StepSearch = Callable[[TileSettings], tuple[TileSettings, Outcome]]
-"""Search for the step that keeps the promise, from that of the settings on."""
 TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
-UNUSUAL = 1.0
-"""dB by which tiles may lose more or less than a head gains, before another step is looked for."""
-FARTHEST = 2.0
-"""Power of the usual factor of the step that is taken at most where tiles lose less."""
-POINTLESS = 0.005
-"""Share of the bytes that a head must cost before the step is searched: then it is left out."""
-LEAST_OCTAVE = 2.0
-"""Fewest dB that an octave of bytes is believed to buy."""
-MOST_OCTAVE = 12.0
-"""Most dB that it is believed to buy."""
-CLOSE = 0.004
-"""Distance in dB from the PSNR that is searched for at which no further step is tried."""
+
+
+class ChosenHead(NamedTuple):
+    """A head that pays, settings with it and their step, and what all tiles should take."""
+
+    settings: TileSettings
+    outcome: Outcome
+    history: HeadHistory
 
 
 class _Candidate(NamedTuple):
-    """A trained head, settings with it, and what the sample takes with these."""
+    """A trained head, and what the tiles take with it at the step that it was trained for."""
 
     trained: TrainedHead
-    settings: TileSettings
     outcome: Outcome
 
+    @property
+    def own_bytes(self) -> int:
+        """Bytes that the head adds to the file."""
+        return len(self.trained.head.to_bytes()) + HEAD_BYTES
 
-def choose_head(
-    task: PlanTask,
-    attempt: Attempt,
-    foretold: float,
-    find_step: StepSearch,
-    look: Callable[[TileSettings], Outcome],
-) -> tuple[TileSettings, Outcome, HeadHistory]:
-    """Return settings with a head and a larger step if they make the sample smaller.
 
-    Otherwise the settings and their outcome are returned as they are. The last result is the
-    training history of the best head, empty if none was trained.
+def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead | None:
+    """Return a head with the step that keeps the promise; None where none makes tiles smaller.
 
-    attempt: without a head.
+    A head is trained on what it will meet, coarser data, which it lifts to the promise. Since it
+    changes no stream, one coding tells what it gains.
+
+    attempt: without a head; its sample is learned from.
     foretold: gain in dB of least squares.
-    find_step: search for the step that keeps the promise with a head.
-    look: codes the sample once, as that search does.
     """
-    sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
-    data_range, spent = task.goal.data_range, EFFORTS[task.config.effort]
-    # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
-    aim = None if task.goal.psnr is None else task.goal.psnr + STEP_AIM
-
-    def train(shape: Shape, budget: Budget, tell: Callable[[float], None]) -> TrainedHead | None:
-        low, high, seed = settings.low, settings.high, task.config.seed
-        return train_head(pairs, low, high, shape, budget, seed=seed, progress=tell)
-
+    goal, settings, spent = task.goal, attempt.settings, EFFORTS[task.config.effort]
     gain = GAIN_OF_HEAD * foretold
-    shapes = likely_heads(outcome.size, gain, EXCHANGE, spent)
+    shapes = likely_heads(attempt.outcome.size, gain, EXCHANGE, spent)
     if not shapes:
         skip("head", f"least squares gain {foretold:.2f} dB: no head would save enough")
-        return settings, outcome, []
-    why = f"at effort {task.config.effort}; least squares gain {foretold:.2f} dB"
-    with stage("head", why):
-        # A head is trained on what it will meet: coarser data, which it lifts to the promise.
-        coarser, octave = replace(settings, step=step_after_gain(settings.step, gain)), EXCHANGE
-        if aim is not None:
-            other = look(coarser)
-            lost = outcome.psnr(data_range) - other.psnr(data_range)
-            if lost > 0 and outcome.size > other.size:
-                octave = lost / math.log2(outcome.size / max(other.size, 1))
-                octave = min(max(octave, LEAST_OCTAVE), MOST_OCTAVE)
-            coarser = _coarsened(settings, coarser, lost, gain)
-        pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
-
-        def train_fully(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
-            return train(shape, spent.budget_of(shape), tell)
-
-        trained = _side_by_side(shapes, train_fully, task.parts)
-        heads = [head for head in trained if head is not None]
-        without = _Compared(outcome, octave, aim, data_range)
-        best = _searched(without, [(head, coarser) for head in heads], find_step, look)
-    if best is None:
-        return settings, outcome, []
-    history = _history(best, data_range)
-    if without.extra_bytes(best) < 0:
-        return best.settings, best.outcome, history
-    return settings, outcome, history
-
-
-def _coarsened(
-    settings: TileSettings, coarser: TileSettings, lost: float, gain: float
-) -> TileSettings:
-    """Return settings of a step at which tiles lose about the dB that a head gains.
-
-    Where most vertices lie on a plateau, tiles lose them much faster than usual.
-
-    coarser: settings of a step at which they lose `lost` dB.
-    """
-    if abs(lost - gain) < UNUSUAL:
-        return coarser
-    share = gain / max(lost, gain / FARTHEST)
-    return replace(settings, step=settings.step * (coarser.step / settings.step) ** share)
-
-
-@dataclass(frozen=True)
-class _Compared:
-    """Comparison of candidates with the tiles without a head."""
-
-    outcome: Outcome
-    """Outcome without a head."""
-    octave: float
-    """dB that an octave of bytes buys."""
-    aim: float | None
-    """PSNR in dB that is searched for; None for a bound, which all outcomes keep."""
-    data_range: float
-    """Range of the values, in data units."""
-
-    def missing(self, candidate: _Candidate) -> float:
-        """Return the dB that a candidate is worse than the tiles without a head."""
-        return self.outcome.psnr(self.data_range) - candidate.outcome.psnr(self.data_range)
-
-    def extra_bytes(self, candidate: _Candidate) -> float:
-        """Return the bytes more than without a head, at the same quality."""
-        size = candidate.outcome.size
-        own_bytes = len(candidate.trained.head.to_bytes()) + HEAD_BYTES
-        extra: float = size - self.outcome.size + own_bytes
-        if self.aim is None:
-            return extra
-        return extra + self.outcome.size * (2 ** (self.missing(candidate) / self.octave) - 1)
-
-
-def _searched(
-    without: _Compared,
-    heads: Sequence[tuple[TrainedHead, TileSettings]],
-    find_step: StepSearch,
-    look: Callable[[TileSettings], Outcome],
-) -> _Candidate | None:
-    """Return the best of some heads with the step that keeps the promise; None of none.
-
-    They are compared at one step, and the step is searched for the best of them alone. It is not
-    where the head would not pay in any case.
-
-    heads: trained heads, each with the settings that it was trained for.
-    """
-    if not heads:
         return None
-    trained = [(head, replace(settings, head=head.head)) for head, settings in heads]
-    candidates = [_Candidate(head, settings, look(settings)) for head, settings in trained]
-    best = min(candidates, key=without.extra_bytes)
-    if without.aim is None:
-        if without.extra_bytes(best) > POINTLESS * without.outcome.size:
-            return best
-        return _Candidate(best.trained, *find_step(best.settings))
-    missing = without.aim - best.outcome.psnr(without.data_range)
-    if abs(missing) < CLOSE or without.extra_bytes(best) > POINTLESS * without.outcome.size:
-        return best
-    nearer = replace(best.settings, step=step_after_gain(best.settings.step, -missing))
-    return _Candidate(best.trained, *find_step(nearer))
+    with stage("head", f"at effort {task.config.effort}; least squares gain {foretold:.2f} dB"):
+        sample = attempt.sample.wider(TRAINING_VERTICES)
+        coarser = replace(settings, step=_step_below(attempt, settings.step, gain))
+        pairs = training_pairs(sample, coarser, attempt.coding)
+
+        def train(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
+            low, high, budget = settings.low, settings.high, spent.budget_of(shape)
+            return train_head(pairs, low, high, shape, budget, seed=task.config.seed, progress=tell)
+
+        heads = [head for head in _side_by_side(shapes, train, task.parts) if head is not None]
+        if goal.psnr is None:
+            return _at_bound(task, attempt, heads, coarser)
+        plain = sample.run(replace(coarser, mask=None), attempt.coding)
+        found = [
+            _Candidate(trained, _corrected(attempt, sample, pairs, trained.head))
+            for trained in heads
+        ]
+
+        def extra(candidate: _Candidate) -> float:
+            gain = candidate.outcome.psnr(goal.data_range) - plain.psnr(goal.data_range)
+            return candidate.own_bytes + plain.size * (1 - 2 ** (gain / EXCHANGE))
+
+        best = min(found, key=extra, default=None)
+        if best is None or extra(best) >= 0:
+            return None
+        more = best.outcome.psnr(goal.data_range) - goal.psnr - AIM
+        step = _step_below(attempt, coarser.step, more)
+        size = round(plain.size * 2 ** (-more / EXCHANGE))
+        return ChosenHead(
+            replace(settings, head=best.trained.head, step=step),
+            replace(attempt.outcome, size=size),
+            _history(best, goal.data_range),
+        )
+
+
+def _step_below(attempt: Attempt, step: float, decibels: float) -> float:
+    """Return the step whose PSNR without a head is lower than that of a step.
+
+    Coefficients foretell it, where there is a promised PSNR.
+    """
+    if attempt.magnitudes is None:
+        return step_after_gain(step, decibels)
+    settings, scale = attempt.settings, scale_of(attempt.settings)
+    error = attempt.magnitudes.error(step * scale) * 10 ** (decibels / 10)
+    least = (settings.high - settings.low) * scale * MIN_STEP_SHARE
+    return attempt.magnitudes.step(error, least) / scale
+
+
+def _corrected(
+    attempt: Attempt, sample: Sample, pairs: Sequence[Pair], head: NeighbourHead
+) -> Outcome:
+    """Return the error of decoded tiles with a head."""
+    outcomes = []
+    for pair, tile in zip(pairs, sample.tiles, strict=True):
+        values = head.apply(pair.decoded).astype(tile.values.dtype, copy=False)
+        coded = CodedTile(data=b"", decoded=values, nonzero=0)
+        outcomes.append(measured(tile, coded, attempt.settings, attempt.coding))
+    return total(outcomes, sample.weights)
+
+
+def _at_bound(
+    task: PlanTask, attempt: Attempt, heads: Sequence[TrainedHead], coarser: TileSettings
+) -> ChosenHead | None:
+    """Return the head of the fewest bytes under a bound, which all tiles keep at any step.
+
+    Parts tell which step costs least.
+    """
+    assert attempt.parts is not None
+    assert attempt.moved is not None
+    coding, best = attempt.coding, None
+    least = attempt.outcome.size
+    for trained in heads:
+        of_parts = replace(coarser, head=trained.head, transform=attempt.moved.transform)
+        found, _ = find_step(attempt.parts, of_parts, coding, task.goal, tries=3)
+        settings = replace(found, transform=coarser.transform)
+        outcome = attempt.sample.run(settings, task.goal.bounded(coding))
+        candidate = _Candidate(trained, outcome)
+        if outcome.size + candidate.own_bytes < least:
+            least = outcome.size + candidate.own_bytes
+            best = ChosenHead(settings, outcome, _history(candidate, task.goal.data_range))
+    return best
 
 
 def _history(candidate: _Candidate, data_range: float) -> HeadHistory:

@@ -213,7 +213,8 @@ def _plan_of(task: PlanTask, attempt: Attempt, *, labels: bool) -> CodingPlan:
     """
     blocks, coding = task.blocks.retile(attempt.sample.blocks.tile), attempt.coding
     coded = attempt.sample.complete and attempt.coded
-    if coding.density and not attempt.coded and prod(blocks.shape) <= SEARCHED:
+    filled = attempt.sample.complete and attempt.sample.filling is not None
+    if coding.density and not filled and prod(blocks.shape) <= SEARCHED:
         with stage("filling", "all tiles, once for all steps of the quantiser"):
             attempt = replace(attempt, sample=tiles_of(task, attempt))
     filled = coding.density > 0 and attempt.sample.complete and blocks.dtype.kind == "f"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from math import prod
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +46,7 @@ from fhash_codec.compact.tiles import (
 from fhash_codec.compact.transform import (
     NONE,
     Bases,
+    Magnitudes,
     in_plane,
     magnitudes_of,
     magnitudes_of_all,
@@ -244,7 +246,7 @@ def _coded(
     parts: coded for the choice.
     size: bytes of all tiles by price.
     """
-    goal, sample = task.goal, Sample(tiled, 1, task.workers)
+    goal, sample, told = task.goal, Sample(tiled, 1, task.workers), Foretold()
     settings = with_mask(task, parts, settings, goal.expected_error)
     moved = moved_transform(parts, settings)
     parts = parts.filled(moved, coding.density)
@@ -261,9 +263,11 @@ def _coded(
     if goal.data_range <= 0:
         pass  # any step gives the one value that there is
     elif goal.psnr is not None:
-        settings, moved, outcome = _promised_step(
+        settings, moved, outcome, told = _promised_step(
             task, settings, moved, tiled, parts, outcome, coding
         )
+        if not coding.fast and task.blocks.dtype.kind == "f":  # integers are rounded besides
+            coding = replace(coding, aim=told.aim)
     else:
         moved, outcome = find_step(parts, moved, with_fill(coding), goal, tries=3)
         settings = replace(moved, transform=settings.transform)
@@ -277,6 +281,7 @@ def _coded(
         coding=coding,
         parts=parts,
         moved=moved,
+        magnitudes=told.magnitudes,
     )
 
 
@@ -297,6 +302,16 @@ def _with_coder(
     return (faster, fast) if ratio <= most else (coding, slow)
 
 
+class Foretold(NamedTuple):
+    """What coefficients tell of the error."""
+
+    magnitudes: Magnitudes | None = None
+    """Of the coefficients of all tiles, or of parts."""
+    aim: float = 0.0
+    """Promised error as a multiple of what they foretell, which each tile aims at (`Coding.aim`); 0
+    where they do not tell it."""
+
+
 def _promised_step(
     task: PlanTask,
     settings: TileSettings,
@@ -305,7 +320,7 @@ def _promised_step(
     parts: Sample,
     outcome: Outcome,
     coding: Coding,
-) -> tuple[TileSettings, TileSettings, Outcome]:
+) -> tuple[TileSettings, TileSettings, Outcome, Foretold]:
     """Return settings of a step that should give the promised PSNR, of tiles and of parts.
 
     The outcome is what is expected of all tiles.
@@ -316,7 +331,7 @@ def _promised_step(
     goal = task.goal
     assert goal.psnr is not None
     for _ in range(LOOKS):
-        step = _step(task, settings, moved, tiled, parts, outcome)
+        step, told = _step(task, settings, moved, tiled, parts, outcome)
         change = min(max(step / settings.step, 1 / FARTHEST), FARTHEST)
         if abs(math.log(change)) < NEAR:
             break
@@ -325,7 +340,7 @@ def _promised_step(
         moved = moved_transform(parts, replace(moved, step=settings.step, double=settings.double))
         outcome = parts.run(moved, with_fill(coding))
     else:
-        step = _step(task, settings, moved, tiled, parts, outcome)
+        step, told = _step(task, settings, moved, tiled, parts, outcome)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
     expected = Outcome(
         size=round(outcome.size * 2**-octaves),
@@ -333,7 +348,7 @@ def _promised_step(
         count=parts.counted,
         max_error=outcome.max_error,
     )
-    return with_step(settings, step, goal), moved, expected
+    return with_step(settings, step, goal), moved, expected, told
 
 
 def _at_promise(outcome: Outcome, goal: Goal) -> float:
@@ -367,7 +382,7 @@ def _step(
     tiled: Blocks,
     parts: Sample,
     outcome: Outcome,
-) -> float:
+) -> tuple[float, Foretold]:
     """Return the step at which all tiles should have the promised error, by their coefficients.
 
     What coefficients foretell is corrected by the true error of coded parts. Where vertices do not
@@ -392,13 +407,16 @@ def _step(
 
     if not (foretold > 0 and outcome.squares > 0):
         even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range * scale)
-        return step_for(even)
+        return step_for(even), Foretold(magnitudes=series)
     error = squared_error(count, goal.psnr + AIM, goal.data_range)
     step = step_for(error * (foretold / outcome.squares))
-    if outcome.bulk_squares == 0:
-        return step
-    error *= outcome.bulk_count / max(outcome.count, 1)
-    return min(step, step_for(error * (foretold / outcome.bulk_squares)))
+    if outcome.bulk_squares > 0:
+        share = outcome.bulk_count / max(outcome.count, 1)
+        of_bulk = step_for(error * share * (foretold / outcome.bulk_squares))
+        if of_bulk < step:
+            return of_bulk, Foretold(magnitudes=series)
+    aim = error * scale**2 / series.error(step * scale) if tiled.complete else 0.0
+    return step, Foretold(magnitudes=series, aim=aim)
 
 
 SEARCHED = 12 << 20
@@ -439,7 +457,7 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
     assert attempt.parts is not None
     assert attempt.moved is not None
     with stage("head trial", "gain of least squares on some parts"):
-        coding = task.goal.bounded(with_fill(attempt.coding))
+        coding = task.goal.bounded(replace(with_fill(attempt.coding), aim=0.0))
         pairs = training_pairs(attempt.parts, attempt.moved, coding)
         low, high = attempt.settings.low, attempt.settings.high
         gain = foretold_gain(pairs, low, high, task.config.seed)
@@ -448,30 +466,22 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
     task.parts.begin("head")
-    attempt = on_all_tiles(task, attempt)
-    coding = with_fill(attempt.coding)
-
-    def find(settings: TileSettings) -> tuple[TileSettings, Outcome]:
-        if task.goal.error is None:
-            return find_step(attempt.sample, settings, coding, task.goal, tries=3)
-        assert attempt.parts is not None
-        assert attempt.moved is not None
-        # All tiles keep a bound at any step: parts tell which costs least.
-        of_parts = replace(settings, transform=attempt.moved.transform)
-        found, _ = find_step(attempt.parts, of_parts, coding, task.goal, tries=3)
-        settings = replace(found, transform=settings.transform)
-        return settings, look(settings)
-
-    def look(settings: TileSettings) -> Outcome:
-        return attempt.sample.run(settings, task.goal.bounded(coding))
-
-    settings, outcome, history = choose_head(
-        task, replace(attempt, coding=coding), gain, find, look
+    if task.goal.psnr is None:
+        attempt = on_all_tiles(task, attempt)
+    elif not attempt.coded:
+        attempt = replace(attempt, sample=tiles_of(task, attempt))
+    found = choose_head(task, replace(attempt, coding=with_fill(attempt.coding)), gain)
+    if found is None:
+        task.gains.note("head (left out)", attempt.outcome)
+        return attempt
+    task.gains.note("head", found.outcome)
+    return replace(
+        attempt,
+        settings=found.settings,
+        outcome=found.outcome,
+        history=found.history,
+        coded=task.goal.psnr is None,
     )
-    if settings.head is None:
-        settings, outcome = find(settings)
-    task.gains.note("head" if settings.head is not None else "head (left out)", outcome)
-    return replace(attempt, settings=settings, outcome=outcome, history=history)
 
 
 def _without_head(task: PlanTask, attempt: Attempt) -> str:

@@ -501,7 +501,7 @@ def _predicted(info: VolumeInfo) -> list[tuple[str, str]]:
 
 
 def tiling_text(info: VolumeInfo) -> str:
-    """The price of the tiles and the time for a region, as far as the header says them."""
+    """The price of the tiles and their coder, as far as the header says them."""
     told = info["model"].get("tiling", {})
     text = ""
     if told.get("price") is not None:
@@ -511,8 +511,6 @@ def tiling_text(info: VolumeInfo) -> str:
             text = f", by price {more:.0%} above the fewest bytes"
     if told.get("coder"):
         text += f"; by the {told['coder']} coder"
-    if told.get("region_ms") is not None:
-        text += f"; regions {number(told['region_ms'], 'ms', digits=2)}"
     return text
 
 

@@ -637,8 +637,7 @@ def _check_model(
 
 def _check_tiling(tiling: Record) -> None:
     """Check `model.tiling`, each of whose keys may be missing."""
-    for key in ("price", "region_ms"):
-        tiling.number_or_null(key)
+    tiling.number_or_null("price")
     if tiling.has("tried"):
         tiling.integer("tried", 0, MAX_LENGTH)
     if tiling.has("coder"):

@@ -15,6 +15,12 @@ constexpr double MAX_RATE_COST = 1 << 19;
 constexpr double SIGN_BITS = 0.85;       // of a sign, which contexts predict a little
 constexpr double NEIGHBOUR_SHARE = 0.3;  // of the counts of the next buckets in those of a bucket
 constexpr double PRIOR_COUNT = 8;        // observations that a geometric distribution stands for
+constexpr double DEAD_ZONE = 0.8;        // steps below which coefficients become 0
+constexpr double SPREAD = 0.1;           // mean squared error of the others, in squared steps
+constexpr int MOST_WEIGHTS = 3;          // by which a squared error is aimed at
+constexpr double CLOSE = 0.002;          // change of the logarithm of the error not worth another
+constexpr double WEIGHT_RANGE = 0.7;     // of the logarithm of the weight, both ways: 1 dB
+constexpr double WEIGHT_SLOPE = 0.35;    // of that of the error by that of the weight, at first
 constexpr int64_t MAX_CHOSEN = 1 << 22;  // from which on an integer is the nearest one
 
 // A sum in the order in which numpy adds 24 numbers.
@@ -55,10 +61,32 @@ std::vector<int32_t> rates_of(const std::vector<int64_t>& counts, double weight)
     return rates;
 }
 
+// Looks for the weight of a bit at which the error is the one that is aimed at, near the usual one.
+//
+// run: chooses integers by a weight, and returns their squared error; below 0 where it fails.
+// first: what the usual weight gives.
+template <class Run> bool aim_at(double wanted, double weight, double first, const Run& run) {
+    double at = 0, slope = WEIGHT_SLOPE, squares = first;  // the logarithm of the weight's change
+    for (int i = 0; i < MOST_WEIGHTS && squares > 0; i++) {
+        const double off = std::log(wanted / squares);
+        const double next = std::min(std::max(at + off / slope, -WEIGHT_RANGE), WEIGHT_RANGE);
+        if (std::fabs(off) < CLOSE || next == at) return true;
+        const double before = squares;
+        squares = run(weight * std::exp(next));
+        if (squares < 0) return false;
+        if (squares > 0) slope = std::log(squares / before) / (next - at);
+        slope = std::min(std::max(slope, 0.05), 2.0);
+        at = next;
+    }
+    return true;
+}
+
 // The integers of the cheapest path through the trellis, searched `passes` times.
+//
+// aim: null for the usual weight.
 template <class T>
 bool choose_levels(const Search<T>& search, const std::vector<T>& scaled, double weight, int passes,
-                   std::vector<int32_t>& levels, fhash_error& error) {
+                   const Aim* aim, std::vector<int32_t>& levels, fhash_error& error) {
     const Table& table = search.table();
     const int64_t bands = (int64_t)table.size() / TABLE_COLUMNS;
     int64_t coded = 0;
@@ -69,20 +97,27 @@ bool choose_levels(const Search<T>& search, const std::vector<T>& scaled, double
         coded += product;
     }
     std::vector<uint8_t> buckets((size_t)coded);
+    std::vector<int64_t> counts;
+    const auto choose = [&](double of) {
+        levels.assign(scaled.size(), 0);
+        return kernel_done(choose_path(scaled.data(), search.shape.data(), table.data(), bands,
+                                       buckets.data(), rates_of(counts, of).data(),
+                                       levels.data()),
+                           "the trellis", error);
+    };
     for (int pass = 0; pass < std::max(passes, 1); pass++) {
-        std::vector<int64_t> counts(2 * BUCKETS * RATES, 0);
+        counts.assign(2 * BUCKETS * RATES, 0);
         const int64_t* const shape = search.shape.data();
-        int64_t code = pass == 0 ? guess_path(scaled.data(), shape, table.data(), bands,
+        const int64_t code = pass == 0 ? guess_path(scaled.data(), shape, table.data(), bands,
                                               buckets.data(), counts.data())
                                  : fhash_trellis_count(levels.data(), shape, table.data(), bands,
                                                        buckets.data(), counts.data());
         if (!kernel_done(code, "the trellis", error)) return false;
-        levels.assign(scaled.size(), 0);
-        code = choose_path(scaled.data(), shape, table.data(), bands, buckets.data(),
-                           rates_of(counts, weight).data(), levels.data());
-        if (!kernel_done(code, "the trellis", error)) return false;
+        if (!choose(weight)) return false;
     }
-    return true;
+    if (!aim) return true;
+    return aim_at(aim->squares, weight, aim->measure(levels),
+                  [&](double of) { return choose(of) ? aim->measure(levels) : -1.0; });
 }
 
 // Coefficients in steps; false where one is too large for the trellis.
@@ -115,6 +150,27 @@ void quantise_all(const std::vector<T>& coefficients, double step, std::vector<i
 }
 
 }  // namespace
+
+template <class T> double foretold_error(const std::vector<T>& coefficients, double step) {
+    const double limit = DEAD_ZONE * step;
+    int exponent;
+    const double mantissa = std::frexp(limit, &exponent);  // from 1/2 up
+    const double bin = std::ldexp(1, exponent - 3);
+    const double low = std::floor(mantissa * 8) * bin, high = low + bin;
+    const double share = (limit - low) / bin, other = SPREAD * step * step;
+    double sums[2] = {0, 0};  // of the squares below the bin, and in it
+    int64_t counts[2] = {0, 0};
+    for (const T c : coefficients) {
+        const double magnitude = std::fabs((double)c), square = magnitude * magnitude;
+        sums[0] += magnitude < low ? square : 0;
+        counts[0] += magnitude < low;
+        sums[1] += magnitude < high ? square : 0;
+        counts[1] += magnitude < high;
+    }
+    const double within = sums[1] - sums[0], there = (double)(counts[1] - counts[0]);
+    const double above = (double)((int64_t)coefficients.size() - counts[1]);
+    return sums[0] + share * within + (above + (1 - share) * there) * other;
+}
 
 bool encode_integers(std::vector<int32_t>& integers, const Shape& shape, const Table& table,
                      const IntegerCoding& how, Buffer& out, fhash_error& error) {
@@ -156,11 +212,12 @@ bool make_search(fhash_context& context, const Settings& settings, const Shape& 
 
 template <class T>
 bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients, double weight,
-                     int passes, std::vector<int32_t>& integers, fhash_error& error) {
+                     int passes, const Aim* aim, std::vector<int32_t>& integers,
+                     fhash_error& error) {
     if (search.settings.trellis) {
         std::vector<T> scaled;
         return scale_all(search, coefficients, scaled) &&
-               choose_levels(search, scaled, weight, passes, integers, error);
+               choose_levels(search, scaled, weight, passes, aim, integers, error);
     }
     std::vector<float> scaled;
     quantise_all(coefficients, search.settings.step, integers, scaled);
@@ -172,8 +229,8 @@ bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients
 
 template <class T>
 bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficients,
-                       const fhash_coding& coding, Buffer& data, std::vector<int32_t>& integers,
-                       fhash_error& error) {
+                       const fhash_coding& coding, const Aim* aim, Buffer& data,
+                       std::vector<int32_t>& integers, fhash_error& error) {
     const Settings& settings = search.settings;
     const bool fast = coding.fast;
     const auto encode = [&](const IntegerCoding& how) {
@@ -187,7 +244,7 @@ bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficien
         return encode({true, true, narrow.data(), coding.weight});
     }
     if (settings.trellis)
-        return choose_integers(search, coefficients, coding.weight, coding.passes, integers,
+        return choose_integers(search, coefficients, coding.weight, coding.passes, aim, integers,
                                error) &&
                encode({true, false, nullptr, 0});
     std::vector<float> scaled;
@@ -330,10 +387,11 @@ bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8
 #define FHASH_CHOOSE(T) \
     template bool make_search(fhash_context&, const Settings&, const Shape&, \
                               std::shared_ptr<Search<T>>&, fhash_error&); \
-    template bool choose_integers(const Search<T>&, const std::vector<T>&, double, int, \
+    template bool choose_integers(const Search<T>&, const std::vector<T>&, double, int, const Aim*, \
                                   std::vector<int32_t>&, fhash_error&); \
     template bool code_coefficients(const Search<T>&, const std::vector<T>&, const fhash_coding&, \
-                                    Buffer&, std::vector<int32_t>&, fhash_error&); \
+                                    const Aim*, Buffer&, std::vector<int32_t>&, fhash_error&); \
+    template double foretold_error(const std::vector<T>&, double); \
     template bool fill_uncounted(const Search<T>&, const uint8_t*, const uint8_t*, int, \
                                  std::vector<T>&, fhash_error&);
 FHASH_CHOOSE(float)

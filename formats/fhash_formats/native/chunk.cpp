@@ -388,7 +388,7 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     trial.draft = {{}, step, typical(task), task.low, task.high,
                    task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE, needs_real64(task, step),
                    true, false, task.origin, task.whole_low, task.whole_high};
-    trial.coding = {WEIGHT, task.error, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
+    trial.coding = {WEIGHT, task.error, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
     const Scaled scaled(task, trial.draft);
     const int64_t most = effort > 1 ? TRIED << 2 * (effort - 2) : 0;
     Form& form = trial.draft.form;
@@ -414,7 +414,7 @@ bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
     const Draft draft = {{}, 1.0, center, center, center, 0, true, false, false, origin,
                          whole, whole};
     const auto settings = draft.settings(task.context, task.shape, error);
-    const fhash_coding coding = {0, -1, 0, 1, 0, 1, 1, 1, 0};
+    const fhash_coding coding = {0, -1, 0, 0, 1, 0, 1, 1, 1, 0};
     const std::vector<uint8_t> nothing((size_t)task.size(), 0);
     return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
                                    nothing.data(), task.marks, coding, coded, error);

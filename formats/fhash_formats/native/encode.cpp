@@ -260,6 +260,7 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
         free += target[(size_t)i] <= (T)low || target[(size_t)i] >= (T)high ||
                 (task.counts() && !task.counts()[i]);
     const double few = FEW * (double)n;
+    if ((double)free <= few) return true;
     double shifts[OFFSET_COUNT];
     for (int i = 0; i < OFFSET_COUNT; i++)
         shifts[i] = settings.offsets[i] / OFFSET_UNIT;
@@ -269,8 +270,8 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
     make_room(integers, (size_t)n);
     make_room(rebuilt, (size_t)n);
     make_room(dequantised, (size_t)n);
-    for (int round = 0; round < coding.rounds && (double)free > few; round++) {
-        if (!choose_integers(search, coefficients, coding.weight, 1, integers, error))
+    for (int round = 0; round < coding.rounds; round++) {
+        if (!choose_integers(search, coefficients, coding.weight, 1, nullptr, integers, error))
             return error.status == FHASH_OK;
         dequantise(integers.data(), n, step, shifts, dequantised.data());
         if (!kernel_done(search.inverse->invert(dequantised.data(), rebuilt.data()), "a transform",
@@ -311,6 +312,22 @@ bool make_residual(const Task& task, const T* base, std::vector<int32_t>& residu
     return nonzero >= 0;
 }
 
+// The squared error of the values that count.
+template <class T> double squared_error(const Task& task, const T* decoded) {
+    double sum = 0;
+    task.typed([&](auto* values) {
+        double lanes[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+        const uint8_t* const counts = task.counts();
+        for (int64_t i = 0; i < task.size(); i++) {
+            const double off = counts && !counts[i] ? 0 : real(values[i]) - (double)decoded[i];
+            lanes[i % 8] += off * off;
+        }
+        for (const double lane : lanes) sum += lane;
+        return true;
+    });
+    return sum;
+}
+
 // The stream of a transformed tile; false without an error where it has to be stored exactly.
 template <class T>
 bool transformed(const Task& task, Coded& coded, fhash_error& error) {
@@ -323,7 +340,21 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
         return false;
     Buffer body, rest, mask;
     std::vector<int32_t> integers, residual;
-    if (!code_coefficients(*search, coefficients, task.coding, body, integers, error)) return false;
+    Aim aim = {task.coding.aim, {}};
+    std::vector<T> tried;
+    if (aim.squares > 0) {
+        aim.squares *= foretold_error(coefficients, settings.step);
+        make_room(tried, (size_t)task.size());
+        aim.measure = [&](std::vector<int32_t>& of) {
+            const bool done = linear_values(settings, *search->inverse, of.data(), tried.data(),
+                                            error);
+            return done ? squared_error(task, tried.data()) : -1;
+        };
+    }
+    if (!code_coefficients(*search, coefficients, task.coding, aim.squares > 0 ? &aim : nullptr,
+                           body, integers, error))
+        return false;
+    tried = {};
     coded.nonzero = (int64_t)integers.size() - std::count(integers.begin(), integers.end(), 0);
     coefficients = {};
     std::vector<T>& linear = target;

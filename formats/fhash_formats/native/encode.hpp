@@ -1,6 +1,8 @@
 // Encoding of a tile: choice of integers, of values without data, and of the form of the stream.
 #pragma once
 
+#include <functional>
+
 #include "kernels.hpp"
 #include "numbers.hpp"
 #include "tile.hpp"
@@ -69,15 +71,27 @@ template <class T>
 bool make_search(fhash_context& context, const Settings& settings, const Shape& shape,
                  std::shared_ptr<Search<T>>& search, fhash_error& error);
 
+// The squared error that coefficients foretell at a step, as compact/transform.py has it of bins of a
+// quarter octave: of the bin where the dead zone ends, a share becomes 0.
+template <class T> double foretold_error(const std::vector<T>& coefficients, double step);
+
+// Squared error that a choice of integers aims at, by a weight of a bit near the usual one.
+struct Aim {
+    double squares;  // 0 for no aim
+    std::function<double(std::vector<int32_t>&)> measure;  // of integers; below 0 where it fails
+};
+
 // The integers of coefficients; false without an error where the trellis has none so large.
+//
+// aim: null for the usual weight of a bit.
 template <class T>
 bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients, double weight,
-                     int passes, std::vector<int32_t>& integers, fhash_error& error);
+                     int passes, const Aim* aim, std::vector<int32_t>& integers, fhash_error& error);
 // The coded coefficients and the integers that they decode to; likewise.
 template <class T>
 bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficients,
-                       const fhash_coding& coding, Buffer& data, std::vector<int32_t>& integers,
-                       fhash_error& error);
+                       const fhash_coding& coding, const Aim* aim, Buffer& data,
+                       std::vector<int32_t>& integers, fhash_error& error);
 
 // `target` with fill values where it is not counted (transform/tile.py, filled).
 template <class T>

@@ -108,15 +108,8 @@ class Planner {
         if (!check_plane(block, kinds)) return false;
         if (!choose_tile(columns, sheets, block, kinds, tile, result)) return false;
         if (tile != box_) {
-            const Set* const sets[2] = {&columns, &sheets};
-            Set cuts[2];
-            for (int i = 0; i < 2; i++) {
-                if (sets[i]->all.empty()) continue;
-                cuts[i].blocks = cut(sets[i]->blocks, within(sets[i]->shape(), tile));
-                cuts[i].all = cuts[i].few = numbers(cuts[i].blocks.all.size());
-            }
-            columns = std::move(cuts[0]);
-            sheets = std::move(cuts[1]);
+            for (Set* const set : {&columns, &sheets})
+                if (!set->all.empty()) *set = cut_set(*set, within(set->shape(), tile));
             if (!order(columns, kinds) || !order(sheets, kinds)) return false;
             int axes = 0;
             for (int a = 0; a < 4; a++) axes |= (tile[(size_t)a] != box_[(size_t)a]) << a;
@@ -303,44 +296,68 @@ class Planner {
         return bytes;
     }
 
+    // The axes along which not all trials are alike, a bit each; y and x go together.
+    static int varied(const std::vector<Kinds>& trials) {
+        int axes = 0;
+        for (const Kinds& trial : trials)
+            for (int a = 0; a < 4; a++)
+                if (!(trial[(size_t)a] == trials[0][(size_t)a])) axes |= a < 2 ? 1 << a : 12;
+        return axes;
+    }
+
+    // The part of a transform along some axes, a bit each.
+    static void take_axes(const Settings& whole, int axes, Settings& part) {
+        for (int a = 0; a < 4; a++)
+            if (axes >> a & 1) part.axes[a] = whole.axes[a];
+    }
+
     // Prices of transforms on blocks; for all that these stand for. The costs are with the bytes of
-    // bases for tiles of a shape.
+    // bases for tiles of a shape. What all trials do alike is done once for each block.
     bool price(const Set& set, const std::vector<size_t>& which, const Shape& tile,
                const std::vector<Kinds>& trials, Price* prices) {
         const Blocks& blocks = set.blocks;
-        std::vector<Settings> settings(trials.size());
-        for (size_t i = 0; i < trials.size(); i++) {
+        const size_t count = trials.size(), jobs = count * which.size();
+        std::vector<Settings> settings(count), own(count);
+        Settings common;
+        const int axes = varied(trials);
+        for (size_t i = 0; i < count; i++) {
             prices[i] = {};
             prices[i].bytes = fit(trials[i], blocks.shape, tile, settings[i].axes);
+            take_axes(settings[i], axes ? axes : 15, own[i]);
         }
-        const size_t jobs = trials.size() * which.size();
+        if (axes) take_axes(settings[0], 15 & ~axes, common);
         std::vector<double> results(2 * jobs);
         std::atomic<size_t> next{0};
         std::atomic<bool> failed{false};
         const auto work = [&](int) {
-            std::vector<float> coefficients;
+            std::vector<float> held, coefficients;
             fhash_error error;
             error.status = FHASH_OK;
-            for (size_t job = next++; job < jobs && !failed; job = next++) {
-                const Settings& of = settings[job / which.size()];
-                const Block& block = blocks.all[which[job % which.size()]];
+            const auto transform = [&](const Settings& of, const std::vector<float>& values,
+                                       std::vector<float>& to) {
                 const auto plan = forward_plan<float>(context_, of, blocks.shape, error);
-                if (!plan) {
-                    failed = true;
-                    return;
+                to.resize(values.size());
+                return plan && plan->transform(values.data(), to.data()) >= 0;
+            };
+            for (size_t place = next++; place < which.size() && !failed; place = next++) {
+                const Block& block = blocks.all[which[place]];
+                if (axes && !transform(common, block.values, held)) failed = true;
+                for (size_t i = 0; i < count && !failed; i++) {
+                    const auto plan =
+                        forward_plan<float>(context_, settings[i], blocks.shape, error);
+                    const FastPrior& prior = fast_prior();
+                    if (!plan || !transform(own[i], axes ? held : block.values, coefficients) ||
+                        fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
+                                          blocks.shape.data(), plan->table.data(),
+                                          (int64_t)plan->table.size() / TABLE_COLUMNS,
+                                          prior.slots.data(), prior.defaults.data(), nullptr, 0,
+                                          &results[2 * (i * which.size() + place)]) < 0)
+                        failed = true;
                 }
-                coefficients.resize(block.values.size());
-                const FastPrior& prior = fast_prior();
-                const int64_t bands = (int64_t)plan->table.size() / TABLE_COLUMNS;
-                if (plan->transform(block.values.data(), coefficients.data()) < 0 ||
-                    fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
-                                      blocks.shape.data(), plan->table.data(), bands,
-                                      prior.slots.data(), prior.defaults.data(), nullptr, 0,
-                                      &results[2 * job]) < 0)
-                    failed = true;
             }
         };
-        together((int)std::min<size_t>((size_t)context_.threads, std::max<size_t>(jobs, 1)), work);
+        const size_t places = std::max<size_t>(which.size(), 1);
+        together((int)std::min((size_t)context_.threads, places), work);
         priced_ += (int64_t)jobs;
         if (failed) return fail(error_, FHASH_ERROR_MEMORY, "a price could not be computed");
         const double n = (double)vertices(blocks.shape);
@@ -554,14 +571,21 @@ class Planner {
             for (int64_t i = 0; i < task_.tile_count && !of_plane; i++) {
                 const int64_t length = task_.tiles[4 * i];
                 if (length >= cuts.columns || cuts.steps.count(length)) continue;
-                const Set few = cut_set(columns, {length, set.shape()[1], set.shape()[2],
-                                                  set.shape()[3]});
+                Shape shape = columns.shape();
+                shape[0] = length;
                 Kinds best = kinds;
                 const std::vector<Kind> options = {{}, {DAUBECHIES_KIND, 2}, {HAAR_KIND, 2}};
-                if (length > 1 && !choose_along(few, few.shape(), 0, options, best)) return false;
-                double of_few;
-                if (!compare(few, best, whole, of_few)) return false;
-                cuts.steps[length] = {of_few, best[0]};
+                if (length > 1) {
+                    Set few;
+                    few.blocks.shape = columns.shape();
+                    for (const size_t number : columns.few)
+                        few.blocks.all.push_back(columns.blocks.all[number]);
+                    const Set parts = cut_set(few, shape);
+                    if (!choose_along(parts, shape, 0, options, best)) return false;
+                }
+                double ratio;
+                if (!compare(cut_set(columns, shape), best, whole, ratio)) return false;
+                cuts.steps[length] = {ratio, best[0]};
             }
         }
         return true;

@@ -70,6 +70,7 @@ class _Coding(ctypes.Structure):
     _fields_ = (
         ("weight", ctypes.c_double),
         ("error", ctypes.c_double),
+        ("aim", ctypes.c_double),
         *((name, ctypes.c_int32) for name in _OPTIONS),
     )
 
@@ -157,6 +158,8 @@ class Coding:
             none.
         error: bound on |decoded - value| at every counted value, in units of the values. It is kept
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
+        aim: squared error that the choice of integers aims at, as a multiple of what coefficients
+            foretell (native/choose.cpp): the weight changes a little for it. 0 for none.
         rounds: how often the values that are free to change are replaced by their decoded values.
         passes: 2 codes the integers that the optimisation chose once more, or searches the path
             through the trellis once more; 1 does not.
@@ -170,6 +173,7 @@ class Coding:
 
     weight: float = 0.0
     error: float | None = None
+    aim: float = 0.0
     rounds: int = 0
     passes: int = 1
     filled: bool = False
@@ -325,7 +329,8 @@ def _coded(
     values = np.ascontiguousarray(values)
     given = None if mask is None else np.ascontiguousarray(mask, np.bool_)
     options = (getattr(coding, name) for name in _OPTIONS)
-    asked = _Coding(coding.weight, -1 if coding.error is None else coding.error, *options)
+    bound = -1 if coding.error is None else coding.error
+    asked = _Coding(coding.weight, bound, coding.aim, *options)
     decoded = np.empty_like(values)
     data, size, nonzero = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_size_t(), ctypes.c_int64()
     t, z, y, x = values.shape

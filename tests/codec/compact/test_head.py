@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,14 +19,12 @@ from reference.head import Head, clip, inputs_of, moved
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.goal import step_after_gain
 from fhash_codec.compact.head import (
     EFFORTS,
     LEAST_GAIN,
     PERCEPTRON,
     Budget,
     Shape,
-    _coarsened,
     _side_by_side,
     likely_heads,
 )
@@ -58,7 +55,6 @@ from fhash_codec.paper.table_step import choose_transform
 from fhash_codec.progress import Parts
 from fhash_formats.transform.head import CROSS, INPUTS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile import OFFSETS
 from fhash_formats.transform.tile_format import TileSettings
 
 
@@ -362,25 +358,6 @@ def test_an_interruption_ends_the_trainings_of_other_threads() -> None:
         _side_by_side(shapes, train, Parts("planning", 6, interrupt))
     assert len(threads) == 2
     assert not any(thread.is_alive() for thread in threads)
-
-
-@pytest.mark.parametrize(("lost", "share"), [(2.2, 1), (4, 0.5), (24, 1 / 12), (0.8, 2), (0, 2)])
-def test_tiles_are_coarsened_by_what_a_head_gains(lost: float, share: float) -> None:
-    """Their loss in dB at the usual step decides, within a power of 2."""
-    fine = TileSettings(
-        transform=usual_transform((2, 4, 4, 4)),
-        step=0.5,
-        center=0.0,
-        low=0.0,
-        high=1.0,
-        offsets=OFFSETS,
-        double=False,
-    )
-    usual = replace(fine, step=step_after_gain(fine.step, 2.0))
-    found = _coarsened(fine, usual, lost, 2.0)
-    assert math.log(found.step / fine.step) == pytest.approx(
-        share * math.log(usual.step / 0.5), 0.01
-    )
 
 
 def test_no_head_is_trained_that_the_other_one_is_sure_to_beat() -> None:

@@ -49,14 +49,16 @@ from fhash_codec.compact.tiles import (
     Tile,
     TileRun,
     code,
+    coding_of,
+    on_trellis,
 )
-from fhash_codec.compact.transform import usual_transform
+from fhash_codec.compact.transform import magnitudes_of, scale_of, usual_transform
 from fhash_codec.config import ACCESSES
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.container import Container
 from fhash_formats.series import ArraySeries, StepsSeries
-from fhash_formats.transform.tile import OFFSETS
+from fhash_formats.transform.tile import OFFSETS, decode_tile
 from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (5, 6, 7, 8)
@@ -691,3 +693,33 @@ ALL = (*[slice(0, 1)] * 3, slice(0, 4))
 def test_corrections_that_are_not_finite_are_damage(dtype: str, wrong: float) -> None:
     with pytest.raises(DamagedFileError, match="corrections has numbers beyond"):
         plain_array([0, wrong, 0, 0], dtype).read(ALL)
+
+
+@pytest.mark.parametrize("share", [0.95, 1.0, 1.05])
+def test_a_tile_errs_as_is_aimed_at(share: float) -> None:
+    """On the trellis, the weight of a bit changes a little for it; so does no setting."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 16, 24, 32)), indexing="ij")
+    noise = np.random.default_rng(3).normal(size=t.shape)
+    values = (np.sin(9 * x + 4 * t) * np.cos(7 * y * z) + 0.05 * noise).astype(np.float32)
+    settings = TileSettings(
+        transform=usual_transform((4, 16, 24, 32)),
+        step=0.1,
+        center=0.0,
+        low=float(values.min()),
+        high=float(values.max()),
+        offsets=OFFSETS,
+        double=False,
+    )
+    settings, coding = on_trellis(settings, coding_of(5))
+    tile = Tile(values, None)
+    _, usual = code(tile, settings, coding)
+    foretold = magnitudes_of(values, settings).error(settings.step * scale_of(settings))
+    foretold /= scale_of(settings) ** 2
+    aim = share * usual.squares / foretold
+    coded, outcome = code(tile, settings, replace(coding, aim=aim))
+    assert outcome.squares == pytest.approx(share * usual.squares, rel=5e-3)
+    decoded = decode_tile(coded.data, (4, 16, 24, 32), np.float32, settings)
+    assert np.array_equal(decoded, coded.decoded)
+    assert outcome.squares == pytest.approx(
+        float(((decoded.astype(float) - values) ** 2).sum()), rel=1e-6
+    )
