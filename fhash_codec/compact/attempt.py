@@ -425,3 +425,5 @@ class Attempt:
     """Settings of these parts."""
     magnitudes: Magnitudes | None = None
     """Of the coefficients of all tiles, or of these parts; None without a promised PSNR."""
+    ratio: float = 0.0
+    """Promised error as a multiple of what these foretell; 0 where they do not tell it."""

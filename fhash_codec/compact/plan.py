@@ -36,6 +36,7 @@ from fhash_codec.compact.transform import usual_transform
 from fhash_codec.compact.trials import (
     SEARCHED,
     is_nearly_exact,
+    of_filled_tiles,
     on_all_tiles,
     plan_by_prices,
     predicted_or_corrected,
@@ -216,7 +217,8 @@ def _plan_of(task: PlanTask, attempt: Attempt, *, labels: bool) -> CodingPlan:
     filled = attempt.sample.complete and attempt.sample.filling is not None
     if coding.density and not filled and prod(blocks.shape) <= SEARCHED:
         with stage("filling", "all tiles, once for all steps of the quantiser"):
-            attempt = replace(attempt, sample=tiles_of(task, attempt))
+            attempt = of_filled_tiles(task, replace(attempt, sample=tiles_of(task, attempt)))
+            coding = attempt.coding
     filled = coding.density > 0 and attempt.sample.complete and blocks.dtype.kind == "f"
     small = prod(blocks.shape) * blocks.dtype.itemsize <= MAX_BYTES_KEPT
     # Bases are fitted to it again where a finer step needs more precise ones.

@@ -266,8 +266,8 @@ def _coded(
         settings, moved, outcome, told = _promised_step(
             task, settings, moved, tiled, parts, outcome, coding
         )
-        if not coding.fast and task.blocks.dtype.kind == "f":  # integers are rounded besides
-            coding = replace(coding, aim=told.aim)
+        if tiled.complete and may_aim(task, coding):
+            coding = replace(coding, aim=told.ratio)
     else:
         moved, outcome = find_step(parts, moved, with_fill(coding), goal, tries=3)
         settings = replace(moved, transform=settings.transform)
@@ -282,7 +282,30 @@ def _coded(
         parts=parts,
         moved=moved,
         magnitudes=told.magnitudes,
+        ratio=told.ratio,
     )
+
+
+def may_aim(task: PlanTask, coding: Coding) -> bool:
+    """Whether tiles can aim at their share of a promised error: integers are rounded besides."""
+    return not coding.fast and task.blocks.dtype.kind == "f"
+
+
+def of_filled_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return a plan with the step by the coefficients of all tiles, which are filled now."""
+    goal, settings = task.goal, attempt.settings
+    if goal.psnr is None or not attempt.ratio or settings.head is not None:
+        return attempt
+    scale, sample = scale_of(settings), attempt.sample
+    tiles = sample.map(lambda tile: magnitudes_of(tile.values, settings))
+    series = weighted(tiles, sample.weights)
+    error = squared_error(sample.counted, goal.psnr + AIM, goal.data_range) * scale**2
+    least = goal.data_range * scale * MIN_STEP_SHARE
+    settings = with_step(settings, series.step(error / attempt.ratio, least) / scale, goal)
+    coding = attempt.coding
+    if may_aim(task, coding):
+        coding = replace(coding, aim=error / series.error(settings.step * scale))
+    return replace(attempt, settings=settings, coding=coding, magnitudes=series)
 
 
 def _with_coder(
@@ -307,9 +330,8 @@ class Foretold(NamedTuple):
 
     magnitudes: Magnitudes | None = None
     """Of the coefficients of all tiles, or of parts."""
-    aim: float = 0.0
-    """Promised error as a multiple of what they foretell, which each tile aims at (`Coding.aim`); 0
-    where they do not tell it."""
+    ratio: float = 0.0
+    """Promised error as a multiple of what they foretell; 0 where they do not tell it."""
 
 
 def _promised_step(
@@ -415,8 +437,8 @@ def _step(
         of_bulk = step_for(error * share * (foretold / outcome.bulk_squares))
         if of_bulk < step:
             return of_bulk, Foretold(magnitudes=series)
-    aim = error * scale**2 / series.error(step * scale) if tiled.complete else 0.0
-    return step, Foretold(magnitudes=series, aim=aim)
+    ratio = error * scale**2 / series.error(step * scale)
+    return step, Foretold(magnitudes=series, ratio=ratio)
 
 
 SEARCHED = 12 << 20

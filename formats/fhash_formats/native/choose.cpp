@@ -17,10 +17,10 @@ constexpr double NEIGHBOUR_SHARE = 0.3;  // of the counts of the next buckets in
 constexpr double PRIOR_COUNT = 8;        // observations that a geometric distribution stands for
 constexpr double DEAD_ZONE = 0.8;        // steps below which coefficients become 0
 constexpr double SPREAD = 0.1;           // mean squared error of the others, in squared steps
-constexpr int MOST_WEIGHTS = 3;          // by which a squared error is aimed at
+constexpr int MOST_WEIGHTS = 4;          // by which a squared error is aimed at
 constexpr double CLOSE = 0.002;          // change of the logarithm of the error not worth another
-constexpr double WEIGHT_RANGE = 0.7;     // of the logarithm of the weight, both ways: 1 dB
-constexpr double WEIGHT_SLOPE = 0.35;    // of that of the error by that of the weight, at first
+constexpr double WEIGHT_RANGE = 1.4;     // of the logarithm of the weight, both ways
+constexpr double WEIGHT_SLOPE = 0.15;    // of that of the error by that of the weight, at first
 constexpr int64_t MAX_CHOSEN = 1 << 22;  // from which on an integer is the nearest one
 
 // A sum in the order in which numpy adds 24 numbers.
@@ -332,14 +332,15 @@ bool bits_of(const Search<T>& search, const std::vector<T>& values, int64_t& bit
     return true;
 }
 
-// Bytes of the coded coefficients.
+// Bytes of the coefficients by the fast coder.
 template <class T>
 bool size_of(const Search<T>& search, const std::vector<T>& values, size_t& size,
              fhash_error& error) {
     std::vector<int32_t> integers;
     Buffer data;
     if (!integers_of(search, values, integers, error) ||
-        !encode_integers(integers, search.shape, search.table(), {}, data, error))
+        !encode_integers(integers, search.shape, search.table(), {false, true, nullptr, 0}, data,
+                         error))
         return false;
     size = data.size();
     return true;

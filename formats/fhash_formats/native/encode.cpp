@@ -239,9 +239,11 @@ double width_of(const Settings& settings) {
 
 // The coefficients after replacements of values that are free: those that do not count, and those
 // at an end of the range that decode to values beyond it, since the decoder clips them.
+//
+// aim: receives the squared error that is aimed at, if any is, by the coefficients as they were.
 template <class T>
 bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>& target,
-                       std::vector<T>& coefficients, fhash_error& error) {
+                       std::vector<T>& coefficients, double& aim, fhash_error& error) {
     const Settings& settings = task.settings;
     const fhash_coding& coding = task.coding;
     const double margin = width_of(settings) * END_MARGIN;
@@ -254,6 +256,7 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
                            "a transform", error);
     };
     if (!transform()) return false;
+    if (coding.aim > 0) aim = coding.aim * foretold_error(coefficients, settings.step);
     if (coding.rounds == 0) return true;
     int64_t free = 0;
     for (int64_t i = 0; i < n; i++)
@@ -334,16 +337,15 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     const Settings& settings = task.settings;
     std::shared_ptr<Search<T>> search;
     std::vector<T> target, coefficients;
+    Aim aim = {0, {}};
     if (!make_search(task.context, settings, task.shape, search, error) ||
         !make_target(task, *search, target, error) ||
-        !free_coefficients(task, *search, target, coefficients, error))
+        !free_coefficients(task, *search, target, coefficients, aim.squares, error))
         return false;
     Buffer body, rest, mask;
     std::vector<int32_t> integers, residual;
-    Aim aim = {task.coding.aim, {}};
     std::vector<T> tried;
     if (aim.squares > 0) {
-        aim.squares *= foretold_error(coefficients, settings.step);
         make_room(tried, (size_t)task.size());
         aim.measure = [&](std::vector<int32_t>& of) {
             const bool done = linear_values(settings, *search->inverse, of.data(), tried.data(),
