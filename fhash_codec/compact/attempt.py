@@ -424,6 +424,6 @@ class Attempt:
     moved: TileSettings | None = None
     """Settings of these parts."""
     magnitudes: Magnitudes | None = None
-    """Of the coefficients of all tiles, or of these parts; None without a promised PSNR."""
+    """Coefficients of all tiles, or of these parts; None without a promised PSNR."""
     ratio: float = 0.0
     """Promised error as a multiple of what these foretell; 0 where they do not tell it."""

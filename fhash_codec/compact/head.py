@@ -133,7 +133,10 @@ TRAINING_VERTICES = 48 << 20
 
 
 class ChosenHead(NamedTuple):
-    """A head that pays, settings with it and their step, and what all tiles should take."""
+    """Settings with a head and their step, and what all tiles should take.
+
+    They are without one where it does not pay; its training is told all the same.
+    """
 
     settings: TileSettings
     outcome: Outcome
@@ -153,7 +156,7 @@ class _Candidate(NamedTuple):
 
 
 def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead | None:
-    """Return a head with the step that keeps the promise; None where none makes tiles smaller.
+    """Return a head with the step that keeps the promise; None where none was trained.
 
     A head is trained on what it will meet, coarser data, which it lifts to the promise. Since it
     changes no stream, one coding tells what it gains.
@@ -190,15 +193,18 @@ def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead
             return candidate.own_bytes + plain.size * (1 - 2 ** (gain / EXCHANGE))
 
         best = min(found, key=extra, default=None)
-        if best is None or extra(best) >= 0:
+        if best is None:
             return None
+        history = _history(best, goal.data_range)
+        if extra(best) >= 0:
+            return ChosenHead(settings, attempt.outcome, history)
         more = best.outcome.psnr(goal.data_range) - goal.psnr - AIM
         step = _step_below(attempt, coarser.step, more)
         size = round(plain.size * 2 ** (-more / EXCHANGE))
         return ChosenHead(
             replace(settings, head=best.trained.head, step=step),
             replace(attempt.outcome, size=size),
-            _history(best, goal.data_range),
+            history,
         )
 
 
@@ -236,17 +242,19 @@ def _at_bound(
     """
     assert attempt.parts is not None
     assert attempt.moved is not None
-    coding, best = attempt.coding, None
-    least = attempt.outcome.size
+    coding, best, least = attempt.coding, None, attempt.outcome.size
     for trained in heads:
         of_parts = replace(coarser, head=trained.head, transform=attempt.moved.transform)
         found, _ = find_step(attempt.parts, of_parts, coding, task.goal, tries=3)
         settings = replace(found, transform=coarser.transform)
         outcome = attempt.sample.run(settings, task.goal.bounded(coding))
         candidate = _Candidate(trained, outcome)
+        history = _history(candidate, task.goal.data_range)
         if outcome.size + candidate.own_bytes < least:
             least = outcome.size + candidate.own_bytes
-            best = ChosenHead(settings, outcome, _history(candidate, task.goal.data_range))
+            best = ChosenHead(settings, outcome, history)
+        elif best is None:
+            best = ChosenHead(attempt.settings, attempt.outcome, history)
     return best
 
 

@@ -304,7 +304,8 @@ def of_filled_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     settings = with_step(settings, series.step(error / attempt.ratio, least) / scale, goal)
     coding = attempt.coding
     if may_aim(task, coding):
-        coding = replace(coding, aim=error / series.error(settings.step * scale))
+        told = series.error(settings.step * scale)
+        coding = replace(coding, aim=error / told if told > 0 else 0.0)
     return replace(attempt, settings=settings, coding=coding, magnitudes=series)
 
 
@@ -326,10 +327,10 @@ def _with_coder(
 
 
 class Foretold(NamedTuple):
-    """What coefficients tell of the error."""
+    """Error of some tiles by their coefficients."""
 
     magnitudes: Magnitudes | None = None
-    """Of the coefficients of all tiles, or of parts."""
+    """Coefficients of all tiles, or of parts."""
     ratio: float = 0.0
     """Promised error as a multiple of what they foretell; 0 where they do not tell it."""
 
@@ -437,7 +438,8 @@ def _step(
         of_bulk = step_for(error * share * (foretold / outcome.bulk_squares))
         if of_bulk < step:
             return of_bulk, Foretold(magnitudes=series)
-    ratio = error * scale**2 / series.error(step * scale)
+    told = series.error(step * scale)
+    ratio = error * scale**2 / told if told > 0 else 0.0
     return step, Foretold(magnitudes=series, ratio=ratio)
 
 
@@ -496,7 +498,7 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
     if found is None:
         task.gains.note("head (left out)", attempt.outcome)
         return attempt
-    task.gains.note("head", found.outcome)
+    task.gains.note("head (left out)" if found.settings.head is None else "head", found.outcome)
     return replace(
         attempt,
         settings=found.settings,

@@ -332,15 +332,14 @@ bool bits_of(const Search<T>& search, const std::vector<T>& values, int64_t& bit
     return true;
 }
 
-// Bytes of the coefficients by the fast coder.
+// Bytes of the coded coefficients.
 template <class T>
 bool size_of(const Search<T>& search, const std::vector<T>& values, size_t& size,
              fhash_error& error) {
     std::vector<int32_t> integers;
     Buffer data;
     if (!integers_of(search, values, integers, error) ||
-        !encode_integers(integers, search.shape, search.table(), {false, true, nullptr, 0}, data,
-                         error))
+        !encode_integers(integers, search.shape, search.table(), {}, data, error))
         return false;
     size = data.size();
     return true;
@@ -388,8 +387,8 @@ bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8
 #define FHASH_CHOOSE(T) \
     template bool make_search(fhash_context&, const Settings&, const Shape&, \
                               std::shared_ptr<Search<T>>&, fhash_error&); \
-    template bool choose_integers(const Search<T>&, const std::vector<T>&, double, int, const Aim*, \
-                                  std::vector<int32_t>&, fhash_error&); \
+    template bool choose_integers(const Search<T>&, const std::vector<T>&, double, int, \
+                                  const Aim*, std::vector<int32_t>&, fhash_error&); \
     template bool code_coefficients(const Search<T>&, const std::vector<T>&, const fhash_coding&, \
                                     const Aim*, Buffer&, std::vector<int32_t>&, fhash_error&); \
     template double foretold_error(const std::vector<T>&, double); \

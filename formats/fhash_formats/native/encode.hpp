@@ -71,8 +71,8 @@ template <class T>
 bool make_search(fhash_context& context, const Settings& settings, const Shape& shape,
                  std::shared_ptr<Search<T>>& search, fhash_error& error);
 
-// The squared error that coefficients foretell at a step, as compact/transform.py has it of bins of a
-// quarter octave: of the bin where the dead zone ends, a share becomes 0.
+// The squared error that coefficients foretell at a step, as compact/transform.py has it of bins of
+// a quarter octave: of the bin where the dead zone ends, a share becomes 0.
 template <class T> double foretold_error(const std::vector<T>& coefficients, double step);
 
 // Squared error that a choice of integers aims at, by a weight of a bit near the usual one.
@@ -86,7 +86,8 @@ struct Aim {
 // aim: null for the usual weight of a bit.
 template <class T>
 bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients, double weight,
-                     int passes, const Aim* aim, std::vector<int32_t>& integers, fhash_error& error);
+                     int passes, const Aim* aim, std::vector<int32_t>& integers,
+                     fhash_error& error);
 // The coded coefficients and the integers that they decode to; likewise.
 template <class T>
 bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficients,

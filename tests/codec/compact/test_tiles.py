@@ -697,7 +697,7 @@ def test_corrections_that_are_not_finite_are_damage(dtype: str, wrong: float) ->
 
 @pytest.mark.parametrize("share", [0.95, 1.0, 1.05])
 def test_a_tile_errs_as_is_aimed_at(share: float) -> None:
-    """On the trellis, the weight of a bit changes a little for it; so does no setting."""
+    """The weight of a bit on the trellis changes a little for it, and no setting does."""
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 16, 24, 32)), indexing="ij")
     noise = np.random.default_rng(3).normal(size=t.shape)
     values = (np.sin(9 * x + 4 * t) * np.cos(7 * y * z) + 0.05 * noise).astype(np.float32)
