@@ -128,7 +128,7 @@ def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
     return size * share - WEIGHT_BYTES * shape.weights - HEAD_BYTES
 
 
-TRAINING_VERTICES = 48 << 20
+TRAINING_VERTICES = 24 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 
 
