@@ -26,6 +26,7 @@ from fhash_formats.support.threads import at_most, usable_threads
 from fhash_formats.transform.head import NeighbourHead
 from fhash_formats.transform.tile import CodedTile
 from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.values import cast
 
 PERCEPTRON = Shape((12, 8), cross=False)
 """Head without a cross: where little is to be gained, its fewer weights may win."""
@@ -84,6 +85,8 @@ LIKELY_OF_TRIAL = (0.85, 1.1)
 """Such multiples that nearly all gains of perceptrons lie between."""
 AIM = 0.02
 """dB above the promise that the step with a head is for."""
+MOST_EXCESS = 6.0
+"""dB above it from which a step is believed to be no coarser than that, since none was tried."""
 AT_ONCE = 2
 """Heads that are trained side by side, at most."""
 WEIGHT_BYTES = 0.7
@@ -198,7 +201,8 @@ def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead
         history = _history(best, goal.data_range)
         if extra(best) >= 0:
             return ChosenHead(settings, attempt.outcome, history)
-        more = best.outcome.psnr(goal.data_range) - goal.psnr - AIM
+        # Without an error left, the PSNR is infinite.
+        more = min(best.outcome.psnr(goal.data_range) - goal.psnr - AIM, MOST_EXCESS)
         step = _step_below(attempt, coarser.step, more)
         size = round(plain.size * 2 ** (-more / EXCHANGE))
         return ChosenHead(
@@ -227,7 +231,7 @@ def _corrected(
     """Return the error of decoded tiles with a head."""
     outcomes = []
     for pair, tile in zip(pairs, sample.tiles, strict=True):
-        values = head.apply(pair.decoded).astype(tile.values.dtype, copy=False)
+        values = cast(head.apply(pair.decoded), tile.values.dtype)
         coded = CodedTile(data=b"", decoded=values, nonzero=0)
         outcomes.append(measured(tile, coded, attempt.settings, attempt.coding))
     return total(outcomes, sample.weights)
