@@ -426,4 +426,4 @@ class Attempt:
     magnitudes: Magnitudes | None = None
     """Coefficients of all tiles, or of these parts; None without a promised PSNR."""
     ratio: float = 0.0
-    """Promised error as a multiple of what these foretell; 0 where they do not tell it."""
+    """Promised error as a multiple of what these predict; 0 where they do not."""

@@ -516,6 +516,8 @@ MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
 
 
+AIM = 0.02
+"""dB above a promised PSNR that a step is for: all tiles are coded again where they fall short."""
 STEP_AIM = 0.005
 """dB above a promised PSNR that a search on a sample is for: all tiles should keep it, too."""
 CLOSE = 0.004

@@ -10,7 +10,7 @@ from threading import Event
 from typing import NamedTuple
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
-from fhash_codec.compact.goal import EXCHANGE, find_step, step_after_gain
+from fhash_codec.compact.goal import AIM, EXCHANGE, find_step, step_after_gain
 from fhash_codec.compact.head_training import (
     Budget,
     Pair,
@@ -19,7 +19,7 @@ from fhash_codec.compact.head_training import (
     train_head,
 )
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, measured, total
+from fhash_codec.compact.tiles import Coding, Outcome, measured, total
 from fhash_codec.compact.transform import scale_of
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.support.threads import at_most, usable_threads
@@ -83,10 +83,8 @@ MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
 """Such multiples that nearly all gains of perceptrons lie between."""
-AIM = 0.02
-"""dB above the promise that the step with a head is for."""
 MOST_EXCESS = 6.0
-"""dB above it from which a step is believed to be no coarser than that, since none was tried."""
+"""dB above the promise that a head is credited with at most, since no such step was tried."""
 AT_ONCE = 2
 """Heads that are trained side by side, at most."""
 WEIGHT_BYTES = 0.7
@@ -185,6 +183,7 @@ def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead
         heads = [head for head in _side_by_side(shapes, train, task.parts) if head is not None]
         if goal.psnr is None:
             return _at_bound(task, attempt, heads, coarser)
+        # The run that the pairs are of, which is not done again.
         plain = sample.run(replace(coarser, mask=None), attempt.coding)
         found = [
             _Candidate(trained, _corrected(attempt, sample, pairs, trained.head))
@@ -215,14 +214,12 @@ def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead
 def _step_below(attempt: Attempt, step: float, decibels: float) -> float:
     """Return the step whose PSNR without a head is lower than that of a step.
 
-    Coefficients foretell it, where there is a promised PSNR.
+    Coefficients predict it, where there is a promised PSNR.
     """
     if attempt.magnitudes is None:
         return step_after_gain(step, decibels)
-    settings, scale = attempt.settings, scale_of(attempt.settings)
-    error = attempt.magnitudes.error(step * scale) * 10 ** (decibels / 10)
-    least = (settings.high - settings.low) * scale * MIN_STEP_SHARE
-    return attempt.magnitudes.step(error, least) / scale
+    error = attempt.magnitudes.error(step * scale_of(attempt.settings)) * 10 ** (decibels / 10)
+    return attempt.magnitudes.step_of(error, attempt.settings)
 
 
 def _corrected(

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.compact.tiles import Blocks, Tile
+from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Tile
 from fhash_codec.measure.errors import pointer
 from fhash_codec.measure.value_range import power_of_two
 from fhash_codec.progress import stage
@@ -234,6 +234,17 @@ class Magnitudes:
             middle = math.sqrt(low * high)
             low, high = (middle, high) if self.error(middle) < error else (low, middle)
         return low
+
+    def step_of(self, error: float, settings: TileSettings) -> float:
+        """Return the step in data units for a sum of squared errors, times `scale_of` squared."""
+        scale = scale_of(settings)
+        least = (settings.high - settings.low) * scale * MIN_STEP_SHARE
+        return self.step(error, least) / scale
+
+    def ratio(self, error: float, settings: TileSettings) -> float:
+        """Return such an error as a multiple of that at the step of the settings; 0 of none."""
+        predicted = self.error(settings.step * scale_of(settings))
+        return error / predicted if predicted > 0 else 0.0
 
     @staticmethod
     def _bin_of(magnitude: float) -> int:

@@ -22,6 +22,7 @@ from fhash_codec.compact.attempt import (
     sub_tile,
 )
 from fhash_codec.compact.goal import (
+    AIM,
     EXCHANGE,
     SLOPE,
     Goal,
@@ -35,7 +36,6 @@ from fhash_codec.compact.planner import QUICK_SHARE, block_of, by_prices, in_par
 from fhash_codec.compact.predictor import choose_predictor
 from fhash_codec.compact.sample import Sample, mask_levels
 from fhash_codec.compact.tiles import (
-    MIN_STEP_SHARE,
     Blocks,
     Coding,
     Outcome,
@@ -70,8 +70,6 @@ FARTHEST = 3.0
 """Factor by which the step changes at most from one look to the next."""
 NEAR = 0.35
 """Change of the logarithm of the step, 2 dB, up to which no further look is needed."""
-AIM = 0.02
-"""dB above the promise that the step is for: all tiles are coded again where they fall short."""
 ROUNDING_ERROR = 12**-0.5
 """Root of the mean squared error of rounding to integers, in data units."""
 
@@ -246,7 +244,7 @@ def _coded(
     parts: coded for the choice.
     size: bytes of all tiles by price.
     """
-    goal, sample, told = task.goal, Sample(tiled, 1, task.workers), Foretold()
+    goal, sample, predicted = task.goal, Sample(tiled, 1, task.workers), PredictedError()
     settings = with_mask(task, parts, settings, goal.expected_error)
     moved = moved_transform(parts, settings)
     parts = parts.filled(moved, coding.density)
@@ -263,11 +261,11 @@ def _coded(
     if goal.data_range <= 0:
         pass  # any step gives the one value that there is
     elif goal.psnr is not None:
-        settings, moved, outcome, told = _promised_step(
+        settings, moved, outcome, predicted = _promised_step(
             task, settings, moved, tiled, parts, outcome, coding
         )
-        if tiled.complete and may_aim(task, coding):
-            coding = replace(coding, aim=told.ratio)
+        if tiled.complete and may_aim(task, settings, coding):
+            coding = replace(coding, aim=predicted.ratio)
     else:
         moved, outcome = find_step(parts, moved, with_fill(coding), goal, tries=3)
         settings = replace(moved, transform=settings.transform)
@@ -281,14 +279,14 @@ def _coded(
         coding=coding,
         parts=parts,
         moved=moved,
-        magnitudes=told.magnitudes,
-        ratio=told.ratio,
+        magnitudes=predicted.magnitudes,
+        ratio=predicted.ratio,
     )
 
 
-def may_aim(task: PlanTask, coding: Coding) -> bool:
+def may_aim(task: PlanTask, settings: TileSettings, coding: Coding) -> bool:
     """Whether tiles can aim at their share of a promised error: integers are rounded besides."""
-    return not coding.fast and task.blocks.dtype.kind == "f"
+    return settings.trellis and not coding.fast and task.blocks.dtype.kind == "f"
 
 
 def of_filled_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -300,12 +298,10 @@ def of_filled_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     tiles = sample.map(lambda tile: magnitudes_of(tile.values, settings))
     series = weighted(tiles, sample.weights)
     error = squared_error(sample.counted, goal.psnr + AIM, goal.data_range) * scale**2
-    least = goal.data_range * scale * MIN_STEP_SHARE
-    settings = with_step(settings, series.step(error / attempt.ratio, least) / scale, goal)
+    settings = with_step(settings, series.step_of(error / attempt.ratio, settings), goal)
     coding = attempt.coding
-    if may_aim(task, coding):
-        told = series.error(settings.step * scale)
-        coding = replace(coding, aim=error / told if told > 0 else 0.0)
+    if may_aim(task, settings, coding):
+        coding = replace(coding, aim=series.ratio(error, settings))
     return replace(attempt, settings=settings, coding=coding, magnitudes=series)
 
 
@@ -326,13 +322,13 @@ def _with_coder(
     return (faster, fast) if ratio <= most else (coding, slow)
 
 
-class Foretold(NamedTuple):
+class PredictedError(NamedTuple):
     """Error of some tiles by their coefficients."""
 
     magnitudes: Magnitudes | None = None
     """Coefficients of all tiles, or of parts."""
     ratio: float = 0.0
-    """Promised error as a multiple of what they foretell; 0 where they do not tell it."""
+    """Promised error as a multiple of what they predict; 0 where they do not."""
 
 
 def _promised_step(
@@ -343,7 +339,7 @@ def _promised_step(
     parts: Sample,
     outcome: Outcome,
     coding: Coding,
-) -> tuple[TileSettings, TileSettings, Outcome, Foretold]:
+) -> tuple[TileSettings, TileSettings, Outcome, PredictedError]:
     """Return settings of a step that should give the promised PSNR, of tiles and of parts.
 
     The outcome is what is expected of all tiles.
@@ -354,7 +350,7 @@ def _promised_step(
     goal = task.goal
     assert goal.psnr is not None
     for _ in range(LOOKS):
-        step, told = _step(task, settings, moved, tiled, parts, outcome)
+        step, predicted = _step(task, settings, moved, tiled, parts, outcome)
         change = min(max(step / settings.step, 1 / FARTHEST), FARTHEST)
         if abs(math.log(change)) < NEAR:
             break
@@ -363,7 +359,7 @@ def _promised_step(
         moved = moved_transform(parts, replace(moved, step=settings.step, double=settings.double))
         outcome = parts.run(moved, with_fill(coding))
     else:
-        step, told = _step(task, settings, moved, tiled, parts, outcome)
+        step, predicted = _step(task, settings, moved, tiled, parts, outcome)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
     expected = Outcome(
         size=round(outcome.size * 2**-octaves),
@@ -371,7 +367,7 @@ def _promised_step(
         count=parts.counted,
         max_error=outcome.max_error,
     )
-    return with_step(settings, step, goal), moved, expected, told
+    return with_step(settings, step, goal), moved, expected, predicted
 
 
 def _at_promise(outcome: Outcome, goal: Goal) -> float:
@@ -405,7 +401,7 @@ def _step(
     tiled: Blocks,
     parts: Sample,
     outcome: Outcome,
-) -> tuple[float, Foretold]:
+) -> tuple[float, PredictedError]:
     """Return the step at which all tiles should have the promised error, by their coefficients.
 
     What coefficients foretell is corrected by the true error of coded parts. Where vertices do not
@@ -423,24 +419,18 @@ def _step(
         count = sum(tiled.weights) * prod(tiled.shape)
     scale = scale_of(settings)
     foretold = few.error(settings.step * scale)
-    least = goal.data_range * scale * MIN_STEP_SHARE
-
-    def step_for(error: float) -> float:
-        return series.step(error, least) / scale
-
     if not (foretold > 0 and outcome.squares > 0):
         even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range * scale)
-        return step_for(even), Foretold(magnitudes=series)
+        return series.step_of(even, settings), PredictedError(magnitudes=series)
     error = squared_error(count, goal.psnr + AIM, goal.data_range)
-    step = step_for(error * (foretold / outcome.squares))
+    step = series.step_of(error * (foretold / outcome.squares), settings)
     if outcome.bulk_squares > 0:
         share = outcome.bulk_count / max(outcome.count, 1)
-        of_bulk = step_for(error * share * (foretold / outcome.bulk_squares))
+        of_bulk = series.step_of(error * share * (foretold / outcome.bulk_squares), settings)
         if of_bulk < step:
-            return of_bulk, Foretold(magnitudes=series)
-    told = series.error(step * scale)
-    ratio = error * scale**2 / told if told > 0 else 0.0
-    return step, Foretold(magnitudes=series, ratio=ratio)
+            return of_bulk, PredictedError(magnitudes=series)
+    ratio = series.ratio(error * scale**2, replace(settings, step=step))
+    return step, PredictedError(magnitudes=series, ratio=ratio)
 
 
 SEARCHED = 12 << 20
@@ -495,10 +485,10 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
     elif not attempt.coded:
         attempt = replace(attempt, sample=tiles_of(task, attempt))
     found = choose_head(task, replace(attempt, coding=with_fill(attempt.coding)), gain)
-    if found is None:
+    if found is None or found.settings.head is None:
         task.gains.note("head (left out)", attempt.outcome)
-        return attempt
-    task.gains.note("head (left out)" if found.settings.head is None else "head", found.outcome)
+        return attempt if found is None else replace(attempt, history=found.history)
+    task.gains.note("head", found.outcome)
     return replace(
         attempt,
         settings=found.settings,

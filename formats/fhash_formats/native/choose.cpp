@@ -151,7 +151,7 @@ void quantise_all(const std::vector<T>& coefficients, double step, std::vector<i
 
 }  // namespace
 
-template <class T> double foretold_error(const std::vector<T>& coefficients, double step) {
+template <class T> double predicted_error(const std::vector<T>& coefficients, double step) {
     const double limit = DEAD_ZONE * step;
     int exponent;
     const double mantissa = std::frexp(limit, &exponent);  // from 1/2 up
@@ -391,7 +391,7 @@ bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8
                                   const Aim*, std::vector<int32_t>&, fhash_error&); \
     template bool code_coefficients(const Search<T>&, const std::vector<T>&, const fhash_coding&, \
                                     const Aim*, Buffer&, std::vector<int32_t>&, fhash_error&); \
-    template double foretold_error(const std::vector<T>&, double); \
+    template double predicted_error(const std::vector<T>&, double); \
     template bool fill_uncounted(const Search<T>&, const uint8_t*, const uint8_t*, int, \
                                  std::vector<T>&, fhash_error&);
 FHASH_CHOOSE(float)

@@ -256,7 +256,7 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
                            "a transform", error);
     };
     if (!transform()) return false;
-    if (coding.aim > 0) aim = coding.aim * foretold_error(coefficients, settings.step);
+    if (coding.aim > 0) aim = coding.aim * predicted_error(coefficients, settings.step);
     if (coding.rounds == 0) return true;
     int64_t free = 0;
     for (int64_t i = 0; i < n; i++)
@@ -344,22 +344,17 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
         return false;
     Buffer body, rest, mask;
     std::vector<int32_t> integers, residual;
-    std::vector<T> tried;
-    if (aim.squares > 0) {
-        make_room(tried, (size_t)task.size());
-        aim.measure = [&](std::vector<int32_t>& of) {
-            const bool done = linear_values(settings, *search->inverse, of.data(), tried.data(),
-                                            error);
-            return done ? squared_error(task, tried.data()) : -1;
-        };
-    }
+    std::vector<T>& linear = target;
+    aim.measure = [&](std::vector<int32_t>& of) {
+        return linear_values(settings, *search->inverse, of.data(), linear.data(), error)
+                   ? squared_error(task, linear.data())
+                   : -1;
+    };
     if (!code_coefficients(*search, coefficients, task.coding, aim.squares > 0 ? &aim : nullptr,
                            body, integers, error))
         return false;
-    tried = {};
     coded.nonzero = (int64_t)integers.size() - std::count(integers.begin(), integers.end(), 0);
     coefficients = {};
-    std::vector<T>& linear = target;
     if (!linear_values(settings, *search->inverse, integers.data(), linear.data(), error))
         return false;
     integers = {};

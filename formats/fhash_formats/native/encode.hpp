@@ -71,9 +71,9 @@ template <class T>
 bool make_search(fhash_context& context, const Settings& settings, const Shape& shape,
                  std::shared_ptr<Search<T>>& search, fhash_error& error);
 
-// The squared error that coefficients foretell at a step, as compact/transform.py has it of bins of
+// The squared error that coefficients predict at a step, as compact/transform.py has it of bins of
 // a quarter octave: of the bin where the dead zone ends, a share becomes 0.
-template <class T> double foretold_error(const std::vector<T>& coefficients, double step);
+template <class T> double predicted_error(const std::vector<T>& coefficients, double step);
 
 // Squared error that a choice of integers aims at, by a weight of a bit near the usual one.
 struct Aim {

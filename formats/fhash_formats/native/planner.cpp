@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <map>
+#include <utility>
 
 #include "basis.hpp"
 #include "encode.hpp"
@@ -305,27 +306,23 @@ class Planner {
         return axes;
     }
 
-    // The part of a transform along some axes, a bit each.
-    static void take_axes(const Settings& whole, int axes, Settings& part) {
-        for (int a = 0; a < 4; a++)
-            if (axes >> a & 1) part.axes[a] = whole.axes[a];
-    }
-
     // Prices of transforms on blocks; for all that these stand for. The costs are with the bytes of
     // bases for tiles of a shape. What all trials do alike is done once for each block.
     bool price(const Set& set, const std::vector<size_t>& which, const Shape& tile,
                const std::vector<Kinds>& trials, Price* prices) {
         const Blocks& blocks = set.blocks;
         const size_t count = trials.size(), jobs = count * which.size();
-        std::vector<Settings> settings(count), own(count);
+        std::vector<Settings> settings(count);
+        std::vector<Table> tables;
         Settings common;
         const int axes = varied(trials);
         for (size_t i = 0; i < count; i++) {
             prices[i] = {};
             prices[i].bytes = fit(trials[i], blocks.shape, tile, settings[i].axes);
-            take_axes(settings[i], axes ? axes : 15, own[i]);
+            tables.push_back(band_table(settings[i].axes, blocks.shape));
+            for (int a = 0; a < 4 && axes; a++)
+                if (!(axes >> a & 1)) common.axes[a] = std::exchange(settings[i].axes[a], {});
         }
-        if (axes) take_axes(settings[0], 15 & ~axes, common);
         std::vector<double> results(2 * jobs);
         std::atomic<size_t> next{0};
         std::atomic<bool> failed{false};
@@ -343,13 +340,11 @@ class Planner {
                 const Block& block = blocks.all[which[place]];
                 if (axes && !transform(common, block.values, held)) failed = true;
                 for (size_t i = 0; i < count && !failed; i++) {
-                    const auto plan =
-                        forward_plan<float>(context_, settings[i], blocks.shape, error);
                     const FastPrior& prior = fast_prior();
-                    if (!plan || !transform(own[i], axes ? held : block.values, coefficients) ||
+                    const int64_t bands = (int64_t)tables[i].size() / TABLE_COLUMNS;
+                    if (!transform(settings[i], axes ? held : block.values, coefficients) ||
                         fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
-                                          blocks.shape.data(), plan->table.data(),
-                                          (int64_t)plan->table.size() / TABLE_COLUMNS,
+                                          blocks.shape.data(), tables[i].data(), bands,
                                           prior.slots.data(), prior.defaults.data(), nullptr, 0,
                                           &results[2 * (i * which.size() + place)]) < 0)
                         failed = true;

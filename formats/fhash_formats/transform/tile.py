@@ -159,7 +159,7 @@ class Coding:
         error: bound on |decoded - value| at every counted value, in units of the values. It is kept
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
         aim: squared error that the choice of integers aims at, as a multiple of what coefficients
-            foretell (native/choose.cpp): the weight changes a little for it. 0 for none.
+            predict (native/choose.cpp): the weight changes a little for it. 0 for none.
         rounds: how often the values that are free to change are replaced by their decoded values.
         passes: 2 codes the integers that the optimisation chose once more, or searches the path
             through the trellis once more; 1 does not.
