@@ -131,10 +131,19 @@ def _price(shape: Shape, tile: Shape, parts: list[int], tiles: int, steps: int) 
     )
 
 
-def first_tile(shape: Shape) -> Shape:
-    """Return the tile for a first look at a series: of small frames it has many steps."""
-    steps = max(FIRST_STEPS, TILE_VERTICES // prod(shape[1:]))
-    return even_tile(shape, max(1, prod(shape) // TILE_VERTICES), min(shape[0], steps))
+def first_tile(shape: Shape, vertices: int = TILE_VERTICES) -> Shape:
+    """Return a tile of about so many vertices, by the shape alone: many steps of small frames."""
+    steps = max(FIRST_STEPS, vertices // prod(shape[1:]))
+    return even_tile(shape, max(1, prod(shape) // vertices), min(shape[0], steps))
+
+
+def quick_tile(shape: Shape, access: str) -> Shape:
+    """Return the tile of a series that nothing is tried for.
+
+    A region takes as long as is wished for, by the fast coder and a bit for each vertex.
+    """
+    most = REGION_MS[access] * 1e6 / decoding_ns(1, "fast")
+    return first_tile(shape, round(min(most, MAX_VERTICES)))
 
 
 MAX_WHOLE_VERTICES = 12 << 20
@@ -286,10 +295,10 @@ def sub_tile(tile: Shape, vertices: int) -> Shape:
     lengths = list(tile)
     for axis in (3, 2, 1, 0):
         while prod(lengths) > vertices and lengths[axis] > 8:
-            lengths[axis] = max(8, lengths[axis] // 2)
+            lengths[axis] = max(8, (lengths[axis] + 1) // 2)
             other = {3: 2, 2: 3}.get(axis)
             if other is not None and prod(lengths) > vertices and lengths[other] > lengths[axis]:
-                lengths[other] = max(8, lengths[other] // 2)
+                lengths[other] = max(8, (lengths[other] + 1) // 2)
     t, z, y, x = lengths
     return t, z, y, x
 
@@ -418,7 +427,7 @@ class Attempt:
     history: HeadHistory = field(default_factory=list)
     """Training of the head."""
     tiling: Tiling | None = None
-    """Choice of the tiles; None where they were asked for."""
+    """Choice of the tiles; None where they were asked for, or follow from the shape."""
     parts: Sample | None = None
     """Parts of the tiles that were coded."""
     moved: TileSettings | None = None

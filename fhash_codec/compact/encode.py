@@ -19,6 +19,7 @@ from fhash_codec.compact.goal import (
     EXCHANGE,
     FINEST_PSNR,
     MAX_STEP_SHARE,
+    QUICK_AIM,
     RATIO_SLACK,
     SLOPE,
     Goal,
@@ -47,6 +48,7 @@ from fhash_codec.compact.tiles import (
     fits_memory,
     measured,
     recoded,
+    return_memory,
     total,
 )
 from fhash_codec.compact.transform import refit, usual_transform
@@ -213,7 +215,7 @@ EXCESS = 0.05
 USUAL_EXCESS = 0.12
 """The same by default. Only series of which a sample was searched miss it, the large ones: a pass
 over 1.5 GB took 10 of 33 seconds for 0.9 % of the bytes."""
-QUICK_EXCESS = 0.35
+QUICK_EXCESS = 0.5
 """Excess in dB that is worth another pass at effort 1."""
 MARGIN = 0.005
 """dB added to the PSNR in the second pass; four times as much in each further one."""
@@ -251,16 +253,18 @@ def code_series(
         coding_plan, goal, bulk = plan_series(
             series, selection, config, workers, progress, overhead=overhead
         )
+        return_memory()
         if goal.psnr is None or goal.data_range == 0:
             table = _code_all(coding_plan, workers, progress)
             if goal.size is not None:
                 window = ByteWindow.of(goal, overhead)
                 table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
         else:
-            excess = EXCESS
-            if config.access != "small":
-                excess = QUICK_EXCESS if config.effort == 1 else USUAL_EXCESS
-            aim = _Aim(psnr=goal.psnr, data_range=goal.data_range, excess=excess)
+            aim = _Aim(psnr=goal.psnr, data_range=goal.data_range)
+            if config.effort == 1:
+                aim = replace(aim, excess=QUICK_EXCESS, margin=QUICK_AIM)
+            elif config.access != "small":
+                aim = replace(aim, excess=USUAL_EXCESS)
             table = _code_to_psnr(coding_plan, aim, workers, progress)
         if _is_exact_by_chance(table, goal):
             blocks = coding_plan.blocks.retile(coding_plan.blocks.shape)
@@ -345,6 +349,8 @@ class _Aim:
     """Range of the values, in data units."""
     excess: float = EXCESS
     """Excess in dB that is worth another pass."""
+    margin: float = 0.0
+    """dB added to the PSNR in each further pass, at least."""
 
     @property
     def min_psnr(self) -> float:
@@ -363,7 +369,7 @@ class _Aim:
 
     def next_target(self, psnr: float, attempt: int) -> float:
         """Return the PSNR to search for after an attempt that reached `psnr`."""
-        return self.min_psnr + MARGIN * float(4**attempt)
+        return self.min_psnr + max(self.margin, MARGIN * float(4**attempt))
 
     def prefers(self, outcome: Outcome, other: Outcome) -> bool:
         """Whether an outcome keeps the promise in fewer bytes, or misses it by less."""
@@ -599,8 +605,10 @@ def encode_compact(
     mark = writer.mark()
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
-    if config.ratio is None:
-        table.plan.blocks.forget()  # all is coded, and measuring needs the memory
+    if config.ratio is None:  # all is coded, and measuring needs the memory
+        table.plan.blocks.forget()
+        table = replace(table, plan=replace(table.plan, sample=None))
+        return_memory()
     for _ in range(WRITINGS):
         parts = table.parts
         with stage("writing", "tiles"):

@@ -26,13 +26,14 @@ from fhash_codec.compact.attempt import (
     PlanTask,
     first_tile,
     is_small,
+    quick_tile,
     region_vertices,
     tiles_of_large,
     tiles_to_try,
 )
 from fhash_codec.compact.goal import with_step
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Blocks, Index
+from fhash_codec.compact.tiles import Blocks
 from fhash_codec.compact.transform import (
     Bases,
     about_center,
@@ -129,9 +130,9 @@ def sheet_of(shape: Shape, vertices: int) -> Shape:
     """Return a part of a box with all of y and x where they can be: t and z are shortened first."""
     t, z, y, x = shape
     while t * z * y * x > vertices and max(t, z) > 2:
-        t, z = (max(2, t // 2), z) if t >= z else (t, max(2, z // 2))
+        t, z = ((t + 1) // 2, z) if t >= z else (t, (z + 1) // 2)
     while t * z * y * x > vertices and max(y, x) > 8:
-        y, x = (y // 2, x) if y >= x else (y, x // 2)
+        y, x = ((y + 1) // 2, x) if y >= x else (y, (x + 1) // 2)
     return t, z, y, x
 
 
@@ -344,8 +345,8 @@ def priced_plan(
 
 def by_prices(
     task: PlanTask, view: Blocks, settings: TileSettings, density: int
-) -> tuple[TileSettings, Priced]:
-    """Return settings with centre, transform and step, and the plan that they are of."""
+) -> tuple[Blocks, TileSettings, Priced]:
+    """Return tiles, settings with centre, transform and step, and the plan that they are of."""
     columns, larger = _parts(task, view, settings, column_of, 1), 1
     center = plateau_center(columns, task.value_range)
     if center is None:
@@ -357,7 +358,7 @@ def by_prices(
     sheets, tiles, block = None, _candidates(task), None
     if columns.blocks.tile[2:] != view.shape[2:]:
         sheets = _parts(task, view, settings, sheet_of, larger)
-    if len(tiles) > 1 and task.config.effort > 1:
+    if len(tiles) > 1:
         cut = view.retile(block_of(view.shape, BLOCK_VERTICES))
         costs = part_costs(task, cut, settings)
         block = Sample(cut, 1, task.workers, costs, task.parts.tick)
@@ -370,13 +371,13 @@ def by_prices(
     columns_filled = filled(columns)
     assert columns_filled is not None
     found = priced_plan(task, settings, columns_filled, filled(sheets), filled(block), tiles)
-    settings = with_step(settings, found.step, task.goal)
+    settings, tiled = with_step(settings, found.step, task.goal), view.retile(found.tile)
     if not task.asks("transform"):
-        return replace(settings, transform=usual_transform(found.tile)), found
+        return tiled, replace(settings, transform=usual_transform(found.tile)), found
     with stage("bases", "the data's own bases, of all lines of the series"):
-        sample = Sample(view.retile(found.tile), 1, task.workers)
+        sample = Sample(tiled, 1, task.workers)
         settings = replace(settings, transform=found.transform(Bases(sample, settings)))
-    return settings, found
+    return tiled, settings, found
 
 
 WINDOWS = 2
@@ -406,6 +407,8 @@ def in_part(blocks: Blocks) -> Blocks:
 
 ROWS = 4
 """Distance in y of the rows that a part's cost is taken from."""
+COSTED = 1 << 16
+"""Differences that are worked on at a time."""
 
 
 def part_costs(task: PlanTask, blocks: Blocks, settings: TileSettings) -> list[float] | None:
@@ -415,19 +418,47 @@ def part_costs(task: PlanTask, blocks: Blocks, settings: TileSettings) -> list[f
     """
     if not blocks.in_memory:
         return None
+    with np.errstate(over="ignore"):
+        per_step = np.float32(1 / (settings.step * scale_of(settings)))
+    y, x = blocks.tile[2:]
+    strides, space = (1, min(ROWS, y), 1), blocks.grid[1:]
 
-    step = settings.step * scale_of(settings)
+    def costs(layer: int) -> npt.NDArray[np.float64]:
+        frames = blocks.layer(layer)
+        rows = frames.values[:, :, :: strides[1]]
+        total = np.zeros(rows.shape[1:], np.float32)
+        count = max(COSTED // prod(rows.shape[1:]), 1)
+        for first in range(0, len(rows), count):
+            values = about_center(rows[first : first + count], settings)
+            with np.errstate(all="ignore"):
+                steps = np.diff(values, axis=3, append=values[..., -1:])
+                bits = np.log2(1 + np.abs(steps) * per_step)
+            total += np.nan_to_num(bits, copy=False, posinf=0).sum(axis=0)
+        total += (blocks.tile[0] - len(rows)) * bits[-1]  # repeated beyond the end
+        total[:, :, x - 1 :: x] = 0  # from one tile to the next
+        sums = _of_parts(np.add, total.astype(np.float64), blocks.tile, space, strides)
+        if frames.counted is None:
+            return sums
+        counts = np.logical_or.reduce(frames.counted, axis=0)
+        there: npt.NDArray[Any] = _of_parts(np.logical_or, counts, blocks.tile, space, (1, 1, 1))
+        return np.where(there, sums, 0.0)
 
-    def cost(index: Index) -> float:
-        tile = blocks.read(index)
-        if tile.is_empty:
-            return 0.0
-        values = about_center(tile.values[:, :, ::ROWS], settings)
-        with np.errstate(all="ignore"):
-            bits = np.log2(1 + np.abs(np.diff(values, axis=3)) * np.float32(1 / step))
-        return float(np.nansum(bits, dtype=np.float64))
+    found: list[float] = np.ravel(list(task.workers.map(costs, range(blocks.grid[0])))).tolist()
+    return found
 
-    return list(task.workers.map(cost, blocks.indices()))
+
+def _of_parts(
+    ufunc: np.ufunc,
+    values: npt.NDArray[Any],
+    tile: Shape,
+    space: tuple[int, int, int],
+    strides: tuple[int, int, int],
+) -> npt.NDArray[Any]:
+    """Return values (z, y, x) of every so manieth vertex, reduced over the tiles of a step."""
+    for axis, (length, count, stride) in enumerate(zip(tile[1:], space, strides, strict=True)):
+        starts = np.minimum(np.arange(count) * length // stride, values.shape[axis] - 1)
+        values = ufunc.reduceat(values, starts, axis=axis)
+    return values
 
 
 def _parts(
@@ -457,6 +488,8 @@ def _candidates(task: PlanTask) -> list[Shape]:
         return [task.fixed_tile]
     if not task.asks("tiles"):
         return [first_tile(shape)]
+    if task.config.effort == 1:
+        return [quick_tile(shape, task.config.access)]
     if is_small(shape) and task.config.access == "balanced":
         return [shape]
     if prod(shape) > MAX_WHOLE_VERTICES:

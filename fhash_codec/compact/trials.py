@@ -19,10 +19,10 @@ from fhash_codec.compact.attempt import (
     PlanTask,
     Tiling,
     decoding_ns,
+    is_small,
     sub_tile,
 )
 from fhash_codec.compact.goal import (
-    AIM,
     EXCHANGE,
     SLOPE,
     Goal,
@@ -32,7 +32,7 @@ from fhash_codec.compact.goal import (
 )
 from fhash_codec.compact.head import LEAST_GAIN, choose_head, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
-from fhash_codec.compact.planner import QUICK_SHARE, block_of, by_prices, in_part, part_costs
+from fhash_codec.compact.planner import block_of, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
 from fhash_codec.compact.sample import Sample, mask_levels
 from fhash_codec.compact.tiles import (
@@ -42,6 +42,7 @@ from fhash_codec.compact.tiles import (
     coding_of,
     off_trellis,
     on_trellis,
+    return_memory,
 )
 from fhash_codec.compact.transform import (
     NONE,
@@ -127,12 +128,12 @@ def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int)
     """
     goal, config = task.goal, task.config
     with stage("plan", "tiles, transform and step, by prices of some parts"):
-        settings, found = by_prices(task, view, settings, density)
+        tiled, settings, found = by_prices(task, view, settings, density)
+    return_memory()
     tiling = None
-    if task.fixed_tile is None:
+    if task.fixed_tile is None and config.effort > 1:
         tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
         tell("plan", f"--access {config.access}: {tiling.describe()}")
-    tiled = view.retile(found.tile)
     coding = coding_of(config.effort, filled=density == 0, density=density, bulk=goal.bulk)
     with stage("step", "coder and step, by coding some parts"):
         parts = coded_parts(task, tiled, settings)
@@ -210,8 +211,7 @@ def coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample
     """Return the parts of the tiles that are coded."""
     blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
     costs = part_costs(task, blocks, settings)
-    vertices = CODED_VERTICES if task.config.effort > 1 else round(QUICK_SHARE * CODED_VERTICES)
-    return Sample(blocks, vertices, task.workers, costs, task.parts.tick)
+    return Sample(blocks, CODED_VERTICES, task.workers, costs, task.parts.tick)
 
 
 def with_fill(coding: Coding) -> Coding:
@@ -251,10 +251,11 @@ def _coded(
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
         moved, _ = on_trellis(moved, coding)
-    slow = task.is_slow(tiled.tile, size)
-    if slow and task.config.effort == 1:
-        coding = replace(coding, fast=True)
-    if slow and not coding.fast:
+    if task.config.effort == 1:
+        quick = FAST_BYTES[task.config.access] > 1 and not is_small(task.blocks.shape)
+        coding = replace(coding, fast=quick)
+        outcome = parts.run(moved, goal.bounded(with_fill(coding)))
+    elif task.is_slow(tiled.tile, size):
         coding, outcome = _with_coder(task, moved, coding, parts, size)
     else:
         outcome = parts.run(moved, goal.bounded(with_fill(coding)))
@@ -297,7 +298,7 @@ def of_filled_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     scale, sample = scale_of(settings), attempt.sample
     tiles = sample.map(lambda tile: magnitudes_of(tile.values, settings))
     series = weighted(tiles, sample.weights)
-    error = squared_error(sample.counted, goal.psnr + AIM, goal.data_range) * scale**2
+    error = squared_error(sample.counted, goal.aim(task.config.effort), goal.data_range) * scale**2
     settings = with_step(settings, series.step_of(error / attempt.ratio, settings), goal)
     coding = attempt.coding
     if may_aim(task, settings, coding):
@@ -413,16 +414,18 @@ def _step(
     goal = task.goal
     assert goal.psnr is not None
     few = weighted([magnitudes_of(tile.values, moved) for tile in parts.tiles], parts.weights)
+    scale = scale_of(settings)
+    foretold = few.error(settings.step * scale)
     series, count = few, parts.counted
     if tiled.complete:
         series = magnitudes_of_all(tiled, settings, task.workers)
         count = sum(tiled.weights) * prod(tiled.shape)
-    scale = scale_of(settings)
-    foretold = few.error(settings.step * scale)
+        # Parts that reach beyond the border have coefficients of vertices that do not count.
+        foretold *= parts.counted / (sum(parts.weights) * prod(parts.blocks.tile))
     if not (foretold > 0 and outcome.squares > 0):
         even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range * scale)
         return series.step_of(even, settings), PredictedError(magnitudes=series)
-    error = squared_error(count, goal.psnr + AIM, goal.data_range)
+    error = squared_error(count, goal.aim(task.config.effort), goal.data_range)
     step = series.step_of(error * (foretold / outcome.squares), settings)
     if outcome.bulk_squares > 0:
         share = outcome.bulk_count / max(outcome.count, 1)

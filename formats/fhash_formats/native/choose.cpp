@@ -120,16 +120,13 @@ bool choose_levels(const Search<T>& search, const std::vector<T>& scaled, double
                   [&](double of) { return choose(of) ? aim->measure(levels) : -1.0; });
 }
 
-// Coefficients in steps; false where one is too large for the trellis.
-template <class T>
-bool scale_all(const Search<T>& search, const std::vector<T>& coefficients,
-               std::vector<T>& scaled) {
+// Makes coefficients multiples of the step; false where one is too large for the trellis.
+template <class T> bool scale_all(const Search<T>& search, std::vector<T>& coefficients) {
     const T unit = (T)(1.0 / search.settings.step);
     bool small = true;
-    scaled.resize(coefficients.size());
-    for (size_t i = 0; i < scaled.size(); i++) {
-        scaled[i] = coefficients[i] * unit;
-        small &= std::fabs(scaled[i]) < (T)LARGEST;  // false for NaN as well
+    for (T& coefficient : coefficients) {
+        coefficient *= unit;
+        small &= std::fabs(coefficient) < (T)LARGEST;  // false for NaN as well
     }
     return small;
 }
@@ -211,24 +208,23 @@ bool make_search(fhash_context& context, const Settings& settings, const Shape& 
 }
 
 template <class T>
-bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients, double weight,
-                     int passes, const Aim* aim, std::vector<int32_t>& integers,
-                     fhash_error& error) {
-    if (search.settings.trellis) {
-        std::vector<T> scaled;
-        return scale_all(search, coefficients, scaled) &&
-               choose_levels(search, scaled, weight, passes, aim, integers, error);
-    }
+bool choose_integers(const Search<T>& search, std::vector<T>& coefficients,
+                     const fhash_coding& coding, int passes, const Aim* aim,
+                     std::vector<int32_t>& integers, fhash_error& error) {
+    const double weight = coding.weight;
+    if (search.settings.trellis)
+        return scale_all(search, coefficients) &&
+               choose_levels(search, coefficients, weight, passes, aim, integers, error);
     std::vector<float> scaled;
     quantise_all(coefficients, search.settings.step, integers, scaled);
     if (weight <= 0) return true;
     Buffer unused;
     return encode_integers(integers, search.shape, search.table(),
-                           {false, false, scaled.data(), weight}, unused, error);
+                           {false, coding.fast != 0, scaled.data(), weight}, unused, error);
 }
 
 template <class T>
-bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficients,
+bool code_coefficients(const Search<T>& search, std::vector<T>& coefficients,
                        const fhash_coding& coding, const Aim* aim, Buffer& data,
                        std::vector<int32_t>& integers, fhash_error& error) {
     const Settings& settings = search.settings;
@@ -237,15 +233,15 @@ bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficien
         return encode_integers(integers, search.shape, search.table(), how, data, error);
     };
     if (settings.trellis && fast) {
-        std::vector<T> scaled;
-        if (!scale_all(search, coefficients, scaled)) return false;
-        const std::vector<float> narrow(scaled.begin(), scaled.end());
+        if (!scale_all(search, coefficients)) return false;
         integers.assign(coefficients.size(), 0);
+        if constexpr (std::is_same<T, float>::value)
+            return encode({true, true, coefficients.data(), coding.weight});
+        const std::vector<float> narrow(coefficients.begin(), coefficients.end());
         return encode({true, true, narrow.data(), coding.weight});
     }
     if (settings.trellis)
-        return choose_integers(search, coefficients, coding.weight, coding.passes, aim, integers,
-                               error) &&
+        return choose_integers(search, coefficients, coding, coding.passes, aim, integers, error) &&
                encode({true, false, nullptr, 0});
     std::vector<float> scaled;
     quantise_all(coefficients, settings.step, integers, scaled);
@@ -387,9 +383,9 @@ bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8
 #define FHASH_CHOOSE(T) \
     template bool make_search(fhash_context&, const Settings&, const Shape&, \
                               std::shared_ptr<Search<T>>&, fhash_error&); \
-    template bool choose_integers(const Search<T>&, const std::vector<T>&, double, int, \
+    template bool choose_integers(const Search<T>&, std::vector<T>&, const fhash_coding&, int, \
                                   const Aim*, std::vector<int32_t>&, fhash_error&); \
-    template bool code_coefficients(const Search<T>&, const std::vector<T>&, const fhash_coding&, \
+    template bool code_coefficients(const Search<T>&, std::vector<T>&, const fhash_coding&, \
                                     const Aim*, Buffer&, std::vector<int32_t>&, fhash_error&); \
     template double predicted_error(const std::vector<T>&, double); \
     template bool fill_uncounted(const Search<T>&, const uint8_t*, const uint8_t*, int, \

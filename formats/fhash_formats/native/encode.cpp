@@ -274,8 +274,10 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
     make_room(rebuilt, (size_t)n);
     make_room(dequantised, (size_t)n);
     for (int round = 0; round < coding.rounds; round++) {
-        if (!choose_integers(search, coefficients, coding.weight, 1, nullptr, integers, error))
+        std::vector<T> chosen = coefficients;
+        if (!choose_integers(search, chosen, coding, 1, nullptr, integers, error))
             return error.status == FHASH_OK;
+        chosen = {};
         dequantise(integers.data(), n, step, shifts, dequantised.data());
         if (!kernel_done(search.inverse->invert(dequantised.data(), rebuilt.data()), "a transform",
                          error))

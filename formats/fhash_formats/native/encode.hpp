@@ -81,16 +81,17 @@ struct Aim {
     std::function<double(std::vector<int32_t>&)> measure;  // of integers; below 0 where it fails
 };
 
-// The integers of coefficients; false without an error where the trellis has none so large.
+// The integers of coefficients, which become multiples of the step; false without an error where
+// the trellis has none so large.
 //
 // aim: null for the usual weight of a bit.
 template <class T>
-bool choose_integers(const Search<T>& search, const std::vector<T>& coefficients, double weight,
-                     int passes, const Aim* aim, std::vector<int32_t>& integers,
-                     fhash_error& error);
+bool choose_integers(const Search<T>& search, std::vector<T>& coefficients,
+                     const fhash_coding& coding, int passes, const Aim* aim,
+                     std::vector<int32_t>& integers, fhash_error& error);
 // The coded coefficients and the integers that they decode to; likewise.
 template <class T>
-bool code_coefficients(const Search<T>& search, const std::vector<T>& coefficients,
+bool code_coefficients(const Search<T>& search, std::vector<T>& coefficients,
                        const fhash_coding& coding, const Aim* aim, Buffer& data,
                        std::vector<int32_t>& integers, fhash_error& error);
 

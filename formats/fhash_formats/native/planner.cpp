@@ -100,17 +100,23 @@ class Planner {
     bool run(fhash_plan_result& result) {
         Set columns = read(task_.columns), sheets;
         if (task_.sheets.count) sheets = read(task_.sheets);
-        Kinds kinds = usual(box_.data());
+        Shape tile = box_;
+        result.price = 1;
+        if (task_.tile_count == 1) {
+            std::copy_n(task_.tiles, 4, tile.begin());
+            cut_sets(columns, sheets, tile);
+        }
+        Kinds kinds = usual(tile.data());
         if (!order(columns, kinds) || !order(sheets, kinds)) return false;
         if (!settle(columns, kinds)) return false;
-        if (!choose(columns, sheets, box_, 15, kinds) || !settle(columns, kinds)) return false;
-        Shape tile;
-        const Set block = read(task_.block);
-        if (!check_plane(block, kinds)) return false;
-        if (!choose_tile(columns, sheets, block, kinds, tile, result)) return false;
-        if (tile != box_) {
-            for (Set* const set : {&columns, &sheets})
-                if (!set->all.empty()) *set = cut_set(*set, within(set->shape(), tile));
+        if (!choose(columns, sheets, tile, 15, kinds) || !settle(columns, kinds)) return false;
+        if (task_.tile_count > 1) {
+            const Set block = read(task_.block);
+            if (!check_plane(block, kinds)) return false;
+            if (!choose_tile(columns, sheets, block, kinds, tile, result)) return false;
+        }
+        if (task_.tile_count > 1 && tile != box_) {
+            cut_sets(columns, sheets, tile);
             if (!order(columns, kinds) || !order(sheets, kinds)) return false;
             int axes = 0;
             for (int a = 0; a < 4; a++) axes |= (tile[(size_t)a] != box_[(size_t)a]) << a;
@@ -593,6 +599,11 @@ class Planner {
         return parts;
     }
 
+    static void cut_sets(Set& columns, Set& sheets, const Shape& tile) {
+        for (Set* const set : {&columns, &sheets})
+            if (!set->all.empty()) *set = cut_set(*set, within(set->shape(), tile));
+    }
+
     // The cost of parts in blocks of a shape as a multiple of another one.
     bool price_ratio(const Set& set, const Shape& shape, const Kinds& kinds, const Price& uncut,
                      double& ratio) {
@@ -654,8 +665,6 @@ class Planner {
     // other axes are cut already: what they foretell of a tile is checked on a large block.
     bool choose_tile(const Set& columns, const Set& sheets, const Set& block, const Kinds& kinds,
                      Shape& tile, fhash_plan_result& result) {
-        result.price = 1;
-        if (task_.tile_count == 1) return std::copy_n(task_.tiles, 4, tile.begin()), true;
         Cuts cuts;
         double bytes;
         if (!price_cuts(columns, sheets, kinds, cuts, bytes)) return false;
