@@ -574,6 +574,13 @@ def _filters() -> Sequence[str]:
     help="Runs of encoding and decoding, of which the fastest counts.",
 )
 @click.option(
+    "--threads",
+    type=click.IntRange(2, 64),
+    metavar="N",
+    help="Run this fhash on N threads, too, and say how much faster that is.",
+)
+@setting_options("effort")
+@click.option(
     "-o",
     "record",
     metavar="FILE.json",
@@ -589,6 +596,8 @@ def kinds(
     beside: str | None,
     peers: tuple[str, ...],
     repeat: int,
+    threads: int | None,
+    settings: dict[str, Any],
     record: str | None,
     force: bool,
     as_json: bool,
@@ -612,6 +621,8 @@ def kinds(
             names=[name for name in dict.fromkeys(peers or FILTERS) if name != NONE],
             repeat=repeat,
             large=large,
+            effort=settings.get("effort"),
+            threads=threads or 1,
             progress=progress,
         )
     if record is not None:

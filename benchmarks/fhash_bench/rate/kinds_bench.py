@@ -37,8 +37,8 @@ from fhash_formats.support.values import Double, Mask, Values
 
 FILTERS = ("SPERR", "SZ3")
 """Peers."""
-OWN, BESIDE = "fhash", "beside"
-"""Names of this fhash and of the other one among the coders."""
+OWN, BESIDE, THREADS = "fhash", "beside", "threads"
+"""Names of this fhash, of the other one and of this one on several threads among the coders."""
 MEASURES = ("bytes", "encode_seconds", "decode_seconds")
 """Figures that ratios are taken of."""
 BULK_SLACK = 0.1
@@ -51,6 +51,8 @@ NOTES = (
     "seconds are those of the processor on one thread, with the array in memory; decoding opens the"
     " file, and the best of 3 counts; region: up to 16 x 16 x 16 vertices of one step of a file"
     " that was just opened, the median of 8 places",
+    "threads: this fhash on several threads, whose seconds are those of the clock; ratios to it are"
+    " how much faster it is, and the worst is the smallest",
     "kept: whether NumPy finds the promise kept on the decoded array, and values at the right"
     " vertices",
     "bytes of a peer are those of its chunks, one for each frame, at the PSNR that fhash reached or"
@@ -78,7 +80,7 @@ class Judged:
 class Figures(Judged):
     """Figures of one coder."""
 
-    coder: Annotated[str, "`fhash`, `beside` or a peer"]
+    coder: Annotated[str, "`fhash`, `beside`, `threads` or a peer"]
     bytes: Annotated[int, "of the file, or of a peer's chunks"]
     encode_seconds: Annotated[float, "of the processor"]
     decode_seconds: Annotated[float, "likewise"]
@@ -104,14 +106,17 @@ class KindCase:
 
 
 class Ratio(TypedDict):
-    """Ratios of a figure of this fhash to that of another coder; below 1, this one is better."""
+    """Ratios of a figure of this fhash to that of another coder; below 1, this one is better.
+
+    Those to more threads of this one are how much faster they are.
+    """
 
     chosen: Annotated[bool, "over kinds that the encoder is decided on, or over the others"]
     coder: Annotated[str, "the other coder"]
     measure: Annotated[str, "`bytes`, `encode_seconds` or `decode_seconds`"]
     mean: Annotated[float, "geometric mean over kinds and goals"]
-    worst: Annotated[float, "the largest"]
-    case: Annotated[str, "kind and goal with the largest"]
+    worst: Annotated[float, "the largest; of `threads` the smallest"]
+    case: Annotated[str, "kind and goal of the worst"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +133,9 @@ class KindsBench:
         """Ratios to each other coder, those over kinds that are only reported first."""
         rows: list[Ratio] = []
         for chosen in (False, True):
-            for coder in (BESIDE, *FILTERS):
-                for measure in MEASURES:
+            for coder in (BESIDE, THREADS, *FILTERS):
+                worst: Any = min if coder == THREADS else max
+                for measure in MEASURES[1:] if coder == THREADS else MEASURES:
                     found = {
                         f"{case.kind}, {case.goal}": getattr(own, measure) / getattr(other, measure)
                         for case in self.cases
@@ -144,8 +150,8 @@ class KindsBench:
                                 coder=coder,
                                 measure=measure,
                                 mean=geometric_mean(found.values()),
-                                worst=max(found.values()),
-                                case=max(found, key=found.__getitem__),
+                                worst=worst(found.values()),
+                                case=worst(found, key=found.__getitem__),
                             )
                         )
         return rows
@@ -163,6 +169,8 @@ def bench_kinds(
     repeat: int = 1,
     large: bool = False,
     scale: float = 1.0,
+    effort: int | None = None,
+    threads: int = 1,
     progress: Progress = silent,
 ) -> KindsBench:
     """Encodes and decodes kinds of data with this fhash, another one and peers.
@@ -174,6 +182,8 @@ def bench_kinds(
         repeat: runs of which the fastest counts.
         large: whether large kinds are measured, too.
         scale: factor of the lengths of the arrays.
+        effort: of all encodings; the default if None.
+        threads: of one more run of this fhash, if more than 1.
 
     Raises InputError for an unknown kind or a folder without fhash, FhashError where an encode
     fails, and MissingDependencyError without hdf5plugin.
@@ -194,13 +204,16 @@ def bench_kinds(
         coders = [stack.enter_context(Coder(OWN, None, folder))]
         if beside is not None:
             coders.append(stack.enter_context(Coder(BESIDE, Path(beside).resolve(), folder)))
+        if threads > 1:
+            coders.append(stack.enter_context(Coder(THREADS, None, folder, threads)))
         run, cases = _Run(coders, peers, repeat, folder), []
         run.warm_up()
         for number, name in enumerate(wanted):
             values, settings = KINDS[name].series(name, scale)
             for goal in (settings, *(EVERY_GOAL if KINDS[name].every_goal else ())):
                 progress("measuring", number, len(wanted), f"{name}, {goal_name(goal)}")
-                cases.append(run.case(name, KINDS[name], values, goal))
+                at_effort = goal if effort is None else {**goal, "effort": effort}
+                cases.append(run.case(name, KINDS[name], values, at_effort))
         progress("measuring", len(wanted), len(wanted), "")
         return KindsBench(
             cases=tuple(cases),
@@ -238,11 +251,13 @@ def coding_process() -> None:
     from fhash_codec.config import EncodeConfig
 
     opened: Any = fhash_codec.open
+    alone = os.environ["FHASH_THREADS"] == "1"
+    clock = time.process_time if alone else time.perf_counter
 
     def seconds(work: Any, *inputs: Any) -> tuple[float, Any]:
-        begun = time.process_time()
+        begun = clock()
         result = work(*inputs)
-        return max(1e-6, time.process_time() - begun), result
+        return max(1e-6, clock() - begun), result
 
     def encode(values: Any, path: str, settings: Any) -> None:
         try:
@@ -290,22 +305,23 @@ class Coder:
         package: folder of the package that it imports.
     """
 
-    def __init__(self, name: str, root: Path | None, folder: Path) -> None:
+    def __init__(self, name: str, root: Path | None, folder: Path, threads: int = 1) -> None:
         """Starts the process.
 
         root: folder with the package of another fhash, None for this one. folder: of its files.
+        threads: with which it codes; the seconds of several are those of the clock.
         Raises InputError where the root has no fhash that can be imported.
         """
         self.name, self._folder = name, folder
         paths = [*([] if root is None else [str(root), str(root / "formats")]), *sys.path]
-        threads = dict.fromkeys(("FHASH_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        names = "FHASH_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"
         lines = "from __future__ import annotations", inspect.getsource(coding_process)
         program = "\n".join([*lines, f"{coding_process.__name__}()"])
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", program],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, **threads, "PYTHONPATH": os.pathsep.join(paths)},
+            env={**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONPATH": os.pathsep.join(paths)},
             text=True,
         )
         try:

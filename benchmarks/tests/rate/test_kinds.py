@@ -164,6 +164,18 @@ def test_kinds_are_measured_beside_the_same_code_and_peers() -> None:
     assert result.commits.keys() == {"fhash", "beside"}
 
 
+def test_kinds_are_measured_at_an_effort_and_on_more_threads() -> None:
+    result = bench_kinds(("single",), names=(), effort=1, threads=2, scale=0.5)
+    (case,) = result.cases
+    assert case.settings["effort"] == 1
+    one, two = case.figures
+    assert (one.coder, two.coder, one.bytes) == ("fhash", "threads", two.bytes)
+    assert {(row["coder"], row["measure"]) for row in result.ratios()} == {
+        ("threads", "encode_seconds"),
+        ("threads", "decode_seconds"),
+    }
+
+
 def test_unknown_kinds_and_folders_without_fhash_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'shok' is no kind; did you mean 'shock'"):
         bench_kinds(("shok",))

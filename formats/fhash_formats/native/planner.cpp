@@ -312,6 +312,19 @@ class Planner {
         return axes;
     }
 
+    // Runs `work` for each number below `count`, by all threads, until it fails. Its second argument
+    // is room that a thread keeps.
+    template <class Work> bool in_threads(size_t count, const Work& work) {
+        std::atomic<size_t> next{0};
+        std::atomic<bool> failed{false};
+        together((int)std::min((size_t)context_.threads, std::max<size_t>(count, 1)), [&](int) {
+            std::vector<float> room;
+            for (size_t number = next++; number < count && !failed; number = next++)
+                if (!work(number, room)) failed = true;
+        });
+        return !failed;
+    }
+
     // Prices of transforms on blocks; for all that these stand for. The costs are with the bytes of
     // bases for tiles of a shape. What all trials do alike is done once for each block.
     bool price(const Set& set, const std::vector<size_t>& which, const Shape& tile,
@@ -330,37 +343,33 @@ class Planner {
                 if (!(axes >> a & 1)) common.axes[a] = std::exchange(settings[i].axes[a], {});
         }
         std::vector<double> results(2 * jobs);
-        std::atomic<size_t> next{0};
-        std::atomic<bool> failed{false};
-        const auto work = [&](int) {
-            std::vector<float> held, coefficients;
+        std::vector<std::vector<float>> held(axes ? which.size() : 0);
+        const auto transform = [&](const Settings& of, const std::vector<float>& values,
+                                   std::vector<float>& to) {
             fhash_error error;
             error.status = FHASH_OK;
-            const auto transform = [&](const Settings& of, const std::vector<float>& values,
-                                       std::vector<float>& to) {
-                const auto plan = forward_plan<float>(context_, of, blocks.shape, error);
-                to.resize(values.size());
-                return plan && plan->transform(values.data(), to.data()) >= 0;
-            };
-            for (size_t place = next++; place < which.size() && !failed; place = next++) {
-                const Block& block = blocks.all[which[place]];
-                if (axes && !transform(common, block.values, held)) failed = true;
-                for (size_t i = 0; i < count && !failed; i++) {
-                    const FastPrior& prior = fast_prior();
-                    const int64_t bands = (int64_t)tables[i].size() / TABLE_COLUMNS;
-                    if (!transform(settings[i], axes ? held : block.values, coefficients) ||
-                        fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
-                                          blocks.shape.data(), tables[i].data(), bands,
-                                          prior.slots.data(), prior.defaults.data(), nullptr, 0,
-                                          &results[2 * (i * which.size() + place)]) < 0)
-                        failed = true;
-                }
-            }
+            const auto plan = forward_plan<float>(context_, of, blocks.shape, error);
+            to.resize(values.size());
+            return plan && plan->transform(values.data(), to.data()) >= 0;
         };
-        const size_t places = std::max<size_t>(which.size(), 1);
-        together((int)std::min((size_t)context_.threads, places), work);
+        const FastPrior& prior = fast_prior();
+        const bool done =
+            in_threads(held.size(),
+                       [&](size_t place, std::vector<float>&) {
+                           return transform(common, blocks.all[which[place]].values, held[place]);
+                       }) &&
+            in_threads(jobs, [&](size_t job, std::vector<float>& coefficients) {
+                const size_t i = job / which.size(), place = job % which.size();
+                const int64_t bands = (int64_t)tables[i].size() / TABLE_COLUMNS;
+                return transform(settings[i], axes ? held[place] : blocks.all[which[place]].values,
+                                 coefficients) &&
+                       fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
+                                         blocks.shape.data(), tables[i].data(), bands,
+                                         prior.slots.data(), prior.defaults.data(), nullptr, 0,
+                                         &results[2 * job]) >= 0;
+            });
         priced_ += (int64_t)jobs;
-        if (failed) return fail(error_, FHASH_ERROR_MEMORY, "a price could not be computed");
+        if (!done) return fail(error_, FHASH_ERROR_MEMORY, "a price could not be computed");
         const double n = (double)vertices(blocks.shape);
         for (size_t job = 0; job < jobs; job++) {
             const Block& block = blocks.all[which[job % which.size()]];
