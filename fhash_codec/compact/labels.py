@@ -181,7 +181,7 @@ def with_step_of(trial: LabelTrial, guess: Attempt) -> LabelTrial:
     return replace(trial, attempt=replace(trial.attempt, settings=settings, coding=coding))
 
 
-TILINGS = 4
+TILINGS = 3
 """Tilings that are coded as labels."""
 CODED_VERTICES = 1 << 20
 """Vertices that are coded of each."""

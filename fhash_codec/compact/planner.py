@@ -213,7 +213,6 @@ class _Result(ctypes.Structure):
         ("step", ctypes.c_double),
         ("bytes", ctypes.c_double),
         ("price", ctypes.c_double),
-        ("priced", ctypes.c_int64),
         ("tried", ctypes.c_int64),
     )
 

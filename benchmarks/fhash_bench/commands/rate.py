@@ -532,9 +532,9 @@ def _kinds() -> Sequence[str]:
 
 
 def _filters() -> Sequence[str]:
-    from fhash_bench.rate.kinds_bench import FILTERS
+    from fhash_bench.rate.kinds_bench import FILTERS, THREADS
 
-    return (*FILTERS, NONE)
+    return (*FILTERS, THREADS, NONE)
 
 
 @click.command(
@@ -548,9 +548,8 @@ def _filters() -> Sequence[str]:
     "kinds",
     type=one_of("kind", _kinds),
     multiple=True,
-    help="A kind, such as shock; repeat. Default: all that take seconds.",
+    help="A kind, such as shock; repeat. Default: all but large, which is 300 MB.",
 )
-@click.option("--large", is_flag=True, help="Add the kind large, 300 MB of float32.")
 @click.option(
     "--beside",
     metavar="DIR",
@@ -563,7 +562,7 @@ def _filters() -> Sequence[str]:
     "peers",
     type=one_of("peer", _filters),
     multiple=True,
-    help="SPERR, SZ3 or none; repeat. Default: both.",
+    help="SPERR, SZ3, threads (fhash on all processors) or none; repeat. Default: SPERR and SZ3.",
 )
 @click.option(
     "--repeat",
@@ -572,12 +571,6 @@ def _filters() -> Sequence[str]:
     default=1,
     show_default=True,
     help="Runs of encoding and decoding, of which the fastest counts.",
-)
-@click.option(
-    "--threads",
-    type=click.IntRange(2, 64),
-    metavar="N",
-    help="Run this fhash on N threads, too, and say how much faster that is.",
 )
 @setting_options("effort")
 @click.option(
@@ -592,11 +585,9 @@ def _filters() -> Sequence[str]:
 @quiet_option
 def kinds(
     kinds: tuple[str, ...],
-    large: bool,
     beside: str | None,
     peers: tuple[str, ...],
     repeat: int,
-    threads: int | None,
     settings: dict[str, Any],
     record: str | None,
     force: bool,
@@ -620,9 +611,7 @@ def kinds(
             beside=beside,
             names=[name for name in dict.fromkeys(peers or FILTERS) if name != NONE],
             repeat=repeat,
-            large=large,
             effort=settings.get("effort"),
-            threads=threads or 1,
             progress=progress,
         )
     if record is not None:

@@ -32,13 +32,13 @@ from fhash_codec.measure.errors import MIN_SHARE
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import FhashError, InputError, suggestion
 from fhash_formats.series import ArraySeries
-from fhash_formats.support.threads import at_most
+from fhash_formats.support.threads import at_most, usable_threads
 from fhash_formats.support.values import Double, Mask, Values
 
 FILTERS = ("SPERR", "SZ3")
 """Peers."""
 OWN, BESIDE, THREADS = "fhash", "beside", "threads"
-"""Names of this fhash, of the other one and of this one on several threads among the coders."""
+"""Names of this fhash, of the other one and of this one on all processors among the coders."""
 MEASURES = ("bytes", "encode_seconds", "decode_seconds")
 """Figures that ratios are taken of."""
 BULK_SLACK = 0.1
@@ -51,7 +51,7 @@ NOTES = (
     "seconds are those of the processor on one thread, with the array in memory; decoding opens the"
     " file, and the best of 3 counts; region: up to 16 x 16 x 16 vertices of one step of a file"
     " that was just opened, the median of 8 places",
-    "threads: this fhash on several threads, whose seconds are those of the clock; ratios to it are"
+    "threads: this fhash on all processors, whose seconds are those of the clock; ratios to it are"
     " how much faster it is, and the worst is the smallest",
     "kept: whether NumPy finds the promise kept on the decoded array, and values at the right"
     " vertices",
@@ -167,10 +167,8 @@ def bench_kinds(
     beside: str | Path | None = None,
     names: Sequence[str] = FILTERS,
     repeat: int = 1,
-    large: bool = False,
     scale: float = 1.0,
     effort: int | None = None,
-    threads: int = 1,
     progress: Progress = silent,
 ) -> KindsBench:
     """Encodes and decodes kinds of data with this fhash, another one and peers.
@@ -178,12 +176,10 @@ def bench_kinds(
     Args:
         kinds: names of KINDS; all that are not large if there are none.
         beside: folder with the package of another fhash, such as a checkout that is built in place.
-        names: peers, of FILTERS.
+        names: peers, of FILTERS, and THREADS.
         repeat: runs of which the fastest counts.
-        large: whether large kinds are measured, too.
         scale: factor of the lengths of the arrays.
         effort: of all encodings; the default if None.
-        threads: of one more run of this fhash, if more than 1.
 
     Raises InputError for an unknown kind or a folder without fhash, FhashError where an encode
     fails, and MissingDependencyError without hdf5plugin.
@@ -191,20 +187,17 @@ def bench_kinds(
     for kind in kinds:
         if kind not in KINDS:
             raise InputError(f"'{kind}' is no kind; {suggestion(kind, KINDS)}")
-    wanted = [
-        name
-        for name, kind in KINDS.items()
-        if (name in kinds if kinds else large or not kind.large)
-    ]
-    filters = all_filters() if names else {}
-    peers = [variant for name in names for variant in filters[name] if variant.layout == "frame"]
+    wanted = [name for name, kind in KINDS.items() if (name in kinds if kinds else not kind.large)]
+    found = [name for name in names if name in FILTERS]
+    filters, threads = all_filters() if found else {}, usable_threads()
+    peers = [variant for name in found for variant in filters[name] if variant.layout == "frame"]
     with ExitStack() as stack:
         stack.enter_context(at_most(1))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fhash-bench-")))
         coders = [stack.enter_context(Coder(OWN, None, folder))]
         if beside is not None:
             coders.append(stack.enter_context(Coder(BESIDE, Path(beside).resolve(), folder)))
-        if threads > 1:
+        if THREADS in names:
             coders.append(stack.enter_context(Coder(THREADS, None, folder, threads)))
         run, cases = _Run(coders, peers, repeat, folder), []
         run.warm_up()
@@ -321,7 +314,11 @@ class Coder:
             [sys.executable, "-P", "-c", program],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONPATH": os.pathsep.join(paths)},
+            env={
+                **os.environ,
+                **dict.fromkeys(names, str(threads)),
+                "PYTHONPATH": os.pathsep.join(paths),
+            },
             text=True,
         )
         try:

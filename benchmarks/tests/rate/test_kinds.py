@@ -164,8 +164,8 @@ def test_kinds_are_measured_beside_the_same_code_and_peers() -> None:
     assert result.commits.keys() == {"fhash", "beside"}
 
 
-def test_kinds_are_measured_at_an_effort_and_on_more_threads() -> None:
-    result = bench_kinds(("single",), names=(), effort=1, threads=2, scale=0.5)
+def test_kinds_are_measured_at_an_effort_and_on_all_processors() -> None:
+    result = bench_kinds(("single",), names=("threads",), effort=1, scale=0.5)
     (case,) = result.cases
     assert case.settings["effort"] == 1
     one, two = case.figures

@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 21
+ABI_VERSION = 22
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p

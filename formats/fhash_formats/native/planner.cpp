@@ -137,7 +137,6 @@ class Planner {
             if (!price(sheets, sheets.all, tile, {kinds}, &found)) return false;
             result.bytes = std::min(result.bytes, found.bytes);
         }
-        result.priced = priced_;
         return true;
     }
 
@@ -150,7 +149,7 @@ class Planner {
     fhash_error& error_;
     Shape box_;
     double step_;
-    int64_t priced_ = 0, tried_ = 0;
+    int64_t tried_ = 0;
     struct Own {
         std::shared_ptr<const Basis> basis;
         Buffer packed;
@@ -312,8 +311,8 @@ class Planner {
         return axes;
     }
 
-    // Runs `work` for each number below `count`, by all threads, until it fails. Its second argument
-    // is room that a thread keeps.
+    // Runs `work` for each number below `count`, by all threads, until it fails. Its second
+    // argument is room that a thread keeps.
     template <class Work> bool in_threads(size_t count, const Work& work) {
         std::atomic<size_t> next{0};
         std::atomic<bool> failed{false};
@@ -368,7 +367,6 @@ class Planner {
                                          prior.slots.data(), prior.defaults.data(), nullptr, 0,
                                          &results[2 * job]) >= 0;
             });
-        priced_ += (int64_t)jobs;
         if (!done) return fail(error_, FHASH_ERROR_MEMORY, "a price could not be computed");
         const double n = (double)vertices(blocks.shape);
         for (size_t job = 0; job < jobs; job++) {

@@ -41,7 +41,6 @@ typedef struct fhash_plan_result {
     double step;                 /* of the plain quantiser */
     double bytes;                /* of all tiles, by price */
     double price;                /* of the tiling, as a multiple of the fewest bytes */
-    int64_t priced;              /* prices, for a report */
     int64_t tried;               /* tilings that were priced */
 } fhash_plan_result;
 
