@@ -455,7 +455,7 @@ def _of_parts(
 ) -> npt.NDArray[Any]:
     """Return values (z, y, x) of every so manieth vertex, reduced over the tiles of a step."""
     for axis, (length, count, stride) in enumerate(zip(tile[1:], space, strides, strict=True)):
-        starts = np.minimum(np.arange(count) * length // stride, values.shape[axis] - 1)
+        starts = np.minimum(-(-length * np.arange(count) // stride), values.shape[axis] - 1)
         values = ufunc.reduceat(values, starts, axis=axis)
     return values
 
