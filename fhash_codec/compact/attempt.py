@@ -140,7 +140,7 @@ def first_tile(shape: Shape, vertices: int = TILE_VERTICES) -> Shape:
 def quick_tile(shape: Shape, access: str) -> Shape:
     """Return the tile of a series that nothing is tried for.
 
-    A region takes as long as is wished for, by the fast coder and a bit for each vertex.
+    A region takes the time that the access allows, by the fast coder and a bit for each vertex.
     """
     most = REGION_MS[access] * 1e6 / decoding_ns(1, "fast")
     return first_tile(shape, round(min(most, MAX_VERTICES)))
@@ -390,6 +390,12 @@ class PlanTask:
         """Thoroughness of filling the vertices that do not count, see `fill`."""
         effort = self.config.effort
         return 8 if effort >= 4 else 4 if effort > 1 else 1
+
+    @property
+    def takes_fast_coder(self) -> bool:
+        """Whether the fast coder is taken without a trial."""
+        quick = self.config.effort == 1 and FAST_BYTES[self.config.access] > 1
+        return quick and not is_small(self.blocks.shape)
 
     def is_slow(self, tile: Shape, size: float) -> bool:
         """Whether reading would take longer than is wished for with the mixing coder.

@@ -182,7 +182,7 @@ def with_step_of(trial: LabelTrial, guess: Attempt) -> LabelTrial:
 
 
 TILINGS = 3
-"""Tilings that are coded as labels."""
+"""Tilings that are coded as labels: a fourth saved 1 % at most."""
 CODED_VERTICES = 1 << 20
 """Vertices that are coded of each."""
 

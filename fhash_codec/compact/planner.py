@@ -54,7 +54,7 @@ PART_VERTICES = 1 << 16
 PRICED_VERTICES = 1 << 18
 """Vertices of all parts of one kind: prices of twice as many chose the same within 0.5 %."""
 QUICK_SHARE = 0.25
-"""Share of all these vertices that effort 1 prices and codes."""
+"""Share of all these vertices that effort 1 prices."""
 OF_PLATEAU = 4
 """Vertices of parts beside a plateau, where they cost little, as a multiple of the usual ones.
 
@@ -407,7 +407,7 @@ def in_part(blocks: Blocks) -> Blocks:
 ROWS = 4
 """Distance in y of the rows that a part's cost is taken from."""
 COSTED = 1 << 16
-"""Differences that are worked on at a time."""
+"""Differences that are worked on at a time, so that they stay in the cache of a core."""
 
 
 def part_costs(task: PlanTask, blocks: Blocks, settings: TileSettings) -> list[float] | None:
@@ -420,11 +420,11 @@ def part_costs(task: PlanTask, blocks: Blocks, settings: TileSettings) -> list[f
     with np.errstate(over="ignore"):
         per_step = np.float32(1 / (settings.step * scale_of(settings)))
     y, x = blocks.tile[2:]
-    strides, space = (1, min(ROWS, y), 1), blocks.grid[1:]
+    apart = min(ROWS, y)
 
     def costs(layer: int) -> npt.NDArray[np.float64]:
         frames = blocks.layer(layer)
-        rows = frames.values[:, :, :: strides[1]]
+        rows = frames.values[:, :, ::apart]
         total = np.zeros(rows.shape[1:], np.float32)
         count = max(COSTED // prod(rows.shape[1:]), 1)
         for first in range(0, len(rows), count):
@@ -435,28 +435,23 @@ def part_costs(task: PlanTask, blocks: Blocks, settings: TileSettings) -> list[f
             total += np.nan_to_num(bits, copy=False, posinf=0).sum(axis=0)
         total += (blocks.tile[0] - len(rows)) * bits[-1]  # repeated beyond the end
         total[:, :, x - 1 :: x] = 0  # from one tile to the next
-        sums = _of_parts(np.add, total.astype(np.float64), blocks.tile, space, strides)
+        sums = _of_tiles(np.add, total.astype(np.float64), blocks, apart)
         if frames.counted is None:
             return sums
         counts = np.logical_or.reduce(frames.counted, axis=0)
-        there: npt.NDArray[Any] = _of_parts(np.logical_or, counts, blocks.tile, space, (1, 1, 1))
-        return np.where(there, sums, 0.0)
+        return np.where(_of_tiles(np.logical_or, counts, blocks, 1), sums, 0.0)
 
     found: list[float] = np.ravel(list(task.workers.map(costs, range(blocks.grid[0])))).tolist()
     return found
 
 
-def _of_parts(
-    ufunc: np.ufunc,
-    values: npt.NDArray[Any],
-    tile: Shape,
-    space: tuple[int, int, int],
-    strides: tuple[int, int, int],
+def _of_tiles(
+    ufunc: np.ufunc, values: npt.NDArray[Any], blocks: Blocks, apart: int
 ) -> npt.NDArray[Any]:
-    """Return values (z, y, x) of every so manieth vertex, reduced over the tiles of a step."""
-    for axis, (length, count, stride) in enumerate(zip(tile[1:], space, strides, strict=True)):
-        starts = np.minimum(-(-length * np.arange(count) // stride), values.shape[axis] - 1)
-        values = ufunc.reduceat(values, starts, axis=axis)
+    """Return values (z, y, x) of rows that lie so far apart in y, reduced over each tile."""
+    for axis, stride in enumerate((1, apart, 1)):
+        starts = -(-blocks.tile[1 + axis] * np.arange(blocks.grid[1 + axis]) // stride)
+        values = ufunc.reduceat(values, np.minimum(starts, values.shape[axis] - 1), axis=axis)
     return values
 
 

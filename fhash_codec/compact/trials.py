@@ -19,7 +19,6 @@ from fhash_codec.compact.attempt import (
     PlanTask,
     Tiling,
     decoding_ns,
-    is_small,
     sub_tile,
 )
 from fhash_codec.compact.goal import (
@@ -134,7 +133,13 @@ def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int)
     if task.fixed_tile is None and config.effort > 1:
         tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
         tell("plan", f"--access {config.access}: {tiling.describe()}")
-    coding = coding_of(config.effort, filled=density == 0, density=density, bulk=goal.bulk)
+    coding = coding_of(
+        config.effort,
+        filled=density == 0,
+        density=density,
+        bulk=goal.bulk,
+        fast=task.takes_fast_coder,
+    )
     with stage("step", "coder and step, by coding some parts"):
         parts = coded_parts(task, tiled, settings)
         attempt = _coded(task, settings, coding, tiled, parts, found.size)
@@ -251,11 +256,7 @@ def _coded(
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
         moved, _ = on_trellis(moved, coding)
-    if task.config.effort == 1:
-        quick = FAST_BYTES[task.config.access] > 1 and not is_small(task.blocks.shape)
-        coding = replace(coding, fast=quick)
-        outcome = parts.run(moved, goal.bounded(with_fill(coding)))
-    elif task.is_slow(tiled.tile, size):
+    if task.config.effort > 1 and task.is_slow(tiled.tile, size):
         coding, outcome = _with_coder(task, moved, coding, parts, size)
     else:
         outcome = parts.run(moved, goal.bounded(with_fill(coding)))
@@ -415,21 +416,21 @@ def _step(
     assert goal.psnr is not None
     few = weighted([magnitudes_of(tile.values, moved) for tile in parts.tiles], parts.weights)
     scale = scale_of(settings)
-    foretold = few.error(settings.step * scale)
+    predicted = few.error(settings.step * scale)
     series, count = few, parts.counted
     if tiled.complete:
         series = magnitudes_of_all(tiled, settings, task.workers)
         count = sum(tiled.weights) * prod(tiled.shape)
         # Parts that reach beyond the border have coefficients of vertices that do not count.
-        foretold *= parts.counted / (sum(parts.weights) * prod(parts.blocks.tile))
-    if not (foretold > 0 and outcome.squares > 0):
+        predicted *= parts.counted / (sum(parts.weights) * prod(parts.blocks.tile))
+    if not (predicted > 0 and outcome.squares > 0):
         even = squared_error(count, goal.even_psnr or goal.psnr, goal.data_range * scale)
         return series.step_of(even, settings), PredictedError(magnitudes=series)
     error = squared_error(count, goal.aim(task.config.effort), goal.data_range)
-    step = series.step_of(error * (foretold / outcome.squares), settings)
+    step = series.step_of(error * (predicted / outcome.squares), settings)
     if outcome.bulk_squares > 0:
         share = outcome.bulk_count / max(outcome.count, 1)
-        of_bulk = series.step_of(error * share * (foretold / outcome.bulk_squares), settings)
+        of_bulk = series.step_of(error * share * (predicted / outcome.bulk_squares), settings)
         if of_bulk < step:
             return of_bulk, PredictedError(magnitudes=series)
     ratio = series.ratio(error * scale**2, replace(settings, step=step))

@@ -114,13 +114,12 @@ class Planner {
             const Set block = read(task_.block);
             if (!check_plane(block, kinds)) return false;
             if (!choose_tile(columns, sheets, block, kinds, tile, result)) return false;
-        }
-        if (task_.tile_count > 1 && tile != box_) {
             cut_sets(columns, sheets, tile);
-            if (!order(columns, kinds) || !order(sheets, kinds)) return false;
             int axes = 0;
             for (int a = 0; a < 4; a++) axes |= (tile[(size_t)a] != box_[(size_t)a]) << a;
-            if (!choose(columns, sheets, tile, axes, kinds)) return false;
+            if (axes && (!order(columns, kinds) || !order(sheets, kinds) ||
+                         !choose(columns, sheets, tile, axes, kinds)))
+                return false;
         }
         Price found;
         if (!settle(columns, kinds) || !price(columns, columns.all, tile, {kinds}, &found))
@@ -607,8 +606,10 @@ class Planner {
     }
 
     static void cut_sets(Set& columns, Set& sheets, const Shape& tile) {
-        for (Set* const set : {&columns, &sheets})
-            if (!set->all.empty()) *set = cut_set(*set, within(set->shape(), tile));
+        for (Set* const set : {&columns, &sheets}) {
+            const Shape inside = within(set->shape(), tile);
+            if (!set->all.empty() && inside != set->shape()) *set = cut_set(*set, inside);
+        }
     }
 
     // The cost of parts in blocks of a shape as a multiple of another one.
