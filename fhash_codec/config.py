@@ -33,7 +33,7 @@ SAMPLES = ("all", "keys", "published")
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""
 
-OPTIONAL_STAGES = ("tiles", "transform", "filling", "head", "predictor", "ssim")
+OPTIONAL_STAGES = ("tiles", "transform", "filling", "predictor", "ssim")
 """Stages of an encoding that `without` may name."""
 
 STAGES_OF_PAPER = ("ssim",)
@@ -51,6 +51,12 @@ DEFAULT_PSNR = 50.0
 """PSNR in dB that is promised where nothing is asked for."""
 DEFAULT_PSNR_BULK = 40.0
 """PSNR in dB that is promised of a wide bulk where nothing is asked for."""
+
+
+TIME_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
+"""Seconds in the units of time that `train` may have."""
+MOST_TRAINING_SECONDS = 86400.0
+"""Longest training that may be asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,9 +193,16 @@ class EncodeConfig(Record):
     effort: int = limits(
         5,
         "compact: 1 prices few candidates and codes in one pass, 2 to 4 price more and weigh bits, "
-        "from 5 on a head is trained, the longer the higher",
+        "from 5 on an MLP is trained, the longer the higher",
         low=1,
         high=9,
+        profile="compact",
+    )
+    train: str = limits(
+        "auto",
+        "compact: how long the MLP behind the table is trained: 'auto' where it should pay and as "
+        "long as the effort says, 'none', or a time such as 30s or 5m of one core, which becomes a "
+        "number of updates",
         profile="compact",
     )
     tile: str = limits(
@@ -208,7 +221,7 @@ class EncodeConfig(Record):
     )
     without: tuple[str, ...] = limits(
         (),
-        "stages to leave out, which then take no time: tiles, transform, filling, head, predictor "
+        "stages to leave out, which then take no time: tiles, transform, filling, predictor "
         "(trials of compact, for fewer bytes) and ssim; repeat, or join by commas",
     )
     tables: str = limits(
@@ -258,6 +271,7 @@ class EncodeConfig(Record):
                 "leaves nothing to choose: give one of them"
             )
         self._check_promises()
+        _ = self.training_seconds  # InputError for what is no time
 
     @staticmethod
     def label(setting: dataclasses.Field[Any]) -> str:
@@ -280,6 +294,23 @@ class EncodeConfig(Record):
         if profile == "paper":
             changes["without"] = tuple(name for name in self.without if name in STAGES_OF_PAPER)
         return dataclasses.replace(self, profile=profile, **changes)
+
+    @property
+    def training_seconds(self) -> float | None:
+        """Seconds of a training that `train` names; None for 'auto', 0 for 'none'."""
+        if self.train in ("auto", "none"):
+            return None if self.train == "auto" else 0.0
+        number, unit = self.train.rstrip("smh"), self.train.lstrip("0123456789.")
+        try:
+            seconds = float(number) * TIME_UNITS[unit]
+        except (KeyError, ValueError):
+            seconds = -1.0
+        if not 0 < seconds <= MOST_TRAINING_SECONDS:
+            raise InputError(
+                f"train is '{self.train:.40}'; allowed: auto, none, or a time up to a day as in "
+                "30s, 5m or 1h"
+            )
+        return seconds
 
     @property
     def bounded(self) -> bool:

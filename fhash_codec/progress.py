@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass
@@ -17,9 +16,6 @@ Progress = Callable[[str, int, int, str], None]
 Within a stage `done` runs from 0 or 1 to `total`, which is at least 1. It stays where it is while
 the note alone moves. A codec calls it in the thread that called the codec, never in another.
 """
-
-POLL_SECONDS = 0.2
-"""Seconds after which a wait for other threads looks for news."""
 
 
 def silent(stage: str, done: int, total: int, note: str) -> None:
@@ -63,27 +59,6 @@ class Parts:
         if (stage, percent) != self._reported:
             self._reported = stage, percent
             self._call(stage, percent, 100, "")
-
-    def wait(
-        self,
-        works: Sequence[Future[Any]],
-        stage: str,
-        share: Callable[[], float],
-        *,
-        poll_seconds: float = POLL_SECONDS,
-    ) -> None:
-        """Wait until all works of other threads are done or one has failed, and report them.
-
-        stage: the work until `share` is 1; then it goes on with trials of the present part.
-        share: share of the stage that is done, 0 to 1.
-        """
-        pending: set[Future[Any]] = set(works)
-        while pending and not any(work.done() and work.exception() for work in works):
-            pending = wait(pending, timeout=poll_seconds)[1]
-            if (done := share()) < 1:
-                self.report(stage, done)
-            else:
-                self._tell()
 
     def _tell(self) -> None:
         note = f"{self._what}, {self._trials} tiles tried" if self._trials else self._what

@@ -428,6 +428,10 @@ class Attempt:
     """Outcome of the sample with these settings."""
     coding: Coding
     """Options of the encoder, without the bound."""
+    plain: Attempt | None = None
+    """The same without an MLP, where the settings have one."""
+    in_doubt: bool = False
+    """Whether it is not sure that the MLP saves bytes."""
     coded: bool = False
     """Whether the outcome is that of all tiles, or of many where a series is large."""
     history: HeadHistory = field(default_factory=list)

@@ -32,7 +32,7 @@ from fhash_codec.compact.goal import (
     search,
     with_step,
 )
-from fhash_codec.compact.head import HEAD_BYTES
+from fhash_codec.compact.head import MLP_BYTES
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
 from fhash_codec.compact.tiles import (
@@ -47,7 +47,6 @@ from fhash_codec.compact.tiles import (
     code_tiles,
     fits_memory,
     measured,
-    recoded,
     return_memory,
     total,
 )
@@ -220,6 +219,11 @@ QUICK_EXCESS = 0.5
 the seconds."""
 MARGIN = 0.005
 """dB added to the PSNR in the second pass; four times as much in each further one."""
+EXCESS_OF_MLP = 0.2
+"""Excess in dB that is worth another pass with an MLP, which takes twice the time and saves 1 % of
+the bytes."""
+MARGIN_OF_MLP = 0.04
+"""dB added at least where an MLP makes the PSNR a less smooth function of the step."""
 UNLIKE = 0.3
 """dB by which all tiles may be worse than the sample before the gain of the head is looked at."""
 NEAR_MISS = 0.1
@@ -255,18 +259,28 @@ def code_series(
             series, selection, config, workers, progress, overhead=overhead
         )
         return_memory()
-        if goal.psnr is None or goal.data_range == 0:
-            table = _code_all(coding_plan, workers, progress)
-            if goal.size is not None:
-                window = ByteWindow.of(goal, overhead)
-                table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
-        else:
+
+        def coded(coding_plan: CodingPlan) -> CodedTable:
+            if goal.psnr is None or goal.data_range == 0:
+                return _code_all(coding_plan, workers, progress)
             aim = _Aim(psnr=goal.psnr, data_range=goal.data_range)
             if config.effort == 1:
                 aim = replace(aim, excess=QUICK_EXCESS, margin=QUICK_AIM)
             elif config.access != "small":
                 aim = replace(aim, excess=USUAL_EXCESS)
-            table = _code_to_psnr(coding_plan, aim, workers, progress)
+            if coding_plan.settings.head is not None:
+                aim = replace(aim, margin=MARGIN_OF_MLP, excess=max(aim.excess, EXCESS_OF_MLP))
+            return _code_to_psnr(coding_plan, aim, workers, progress)
+
+        table = coded(coding_plan)
+        if goal.size is not None:
+            window = ByteWindow.of(goal, overhead)
+            table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
+        plain = coding_plan.plain
+        if plain is not None and coding_plan.in_doubt and table.plan.settings.head is not None:
+            other = coded(plain)
+            if other.outcome.size < table.outcome.size + head_bytes(table):
+                table = other
         if _is_exact_by_chance(table, goal):
             blocks = coding_plan.blocks.retile(coding_plan.blocks.shape)
             about = selection.scanned.value_range.moved(-blocks.origin)
@@ -414,7 +428,7 @@ def _rescued(
             break
         finer = min(finer**2, MAX_FINER)
         refined = with_step(replace(settings, head=None), step, table.plan.goal)
-        if not refined.double:  # a head works in float32 only
+        if not refined.double:  # an MLP works in float32 only
             refined = replace(refined, head=settings.head)
         table = _code_all(replace(table.plan, settings=refined), workers, progress)
         if aim.prefers(table.outcome, best.outcome):
@@ -432,13 +446,15 @@ def _search_psnr(
     """Code all tiles with step after step; the best table of these and of the one given."""
     secants = psnr_search(coding_plan.settings)
 
+    def holds(table: CodedTable) -> bool:
+        return _head_holds(table, aim, lambda plan: _code_all(plan, workers, progress))
+
     def following(table: CodedTable, attempt: int) -> tuple[CodingPlan, str] | None:
         plan, psnr = table.plan, aim.psnr_of(table.outcome)
         if aim.is_met(psnr, attempt):
             return None
         require_reach(plan.goal, plan.settings, table.outcome)
-        unlike = psnr < aim.min_psnr - UNLIKE and attempt == 0
-        if unlike and not _head_holds(table, aim, workers):
+        if psnr < aim.min_psnr - UNLIKE and attempt == 0 and not holds(table):
             return None
         before = plan.settings.step
         step = secants.after(before, psnr, aim.next_target(psnr, attempt))
@@ -457,40 +473,33 @@ def _search_psnr(
     return found if best is None or prefers(found, best) else best
 
 
-def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bool:
-    """Whether the head of a table, if any, saves more bytes in all tiles than it takes.
+def _head_holds(table: CodedTable, aim: _Aim, code_all: CodeAll) -> bool:
+    """Whether the MLP of a table, if any, saves more bytes in all tiles than it takes.
 
-    It may gain much there although all tiles are worse than the sample. What the tiles are without
-    it is measured by decoding them once more.
+    It may gain much there although all tiles are worse than the sample. What they are without it is
+    told by coding them once more.
     """
-    settings, blocks = table.plan.settings, table.plan.blocks
-    if settings.head is None:
+    if table.plan.plain is None or table.plan.settings.head is None:
         return True
-    plain = replace(settings, head=None)
-
-    def measure(job: tuple[bytes, Index | Tile]) -> Worked:
-        stream, source = job
-        tile = _tile_of(blocks, source)
-        coded = recoded(tile, stream, plain)
-        return stream, measured(tile, coded, plain, table.plan.coding), None
-
-    sources = (_readable(blocks, index) for index in blocks.indices())
-    jobs = zip(table.streams, sources, strict=True)
-    with stage("coding", "gain of the head in all tiles"):
-        without = code_tiles(jobs, measure, workers).outcome
+    with stage("coding", "gain of the MLP in all tiles"):
+        without = code_all(table.plan.plain).outcome
     gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
-    size = table.outcome.size
-    own = len(settings.head.to_bytes()) + HEAD_BYTES
-    return size * (2 ** (gain / EXCHANGE) - 1) > own
+    return without.size * 2 ** (gain / EXCHANGE) > table.outcome.size + head_bytes(table)
+
+
+def head_bytes(table: CodedTable) -> int:
+    """Return the bytes that the MLP of a table adds to the file, if it has one."""
+    head = table.plan.settings.head
+    return 0 if head is None else len(head.to_bytes()) + MLP_BYTES
 
 
 def _simpler_plans(coding_plan: CodingPlan) -> Iterator[CodingPlan]:
     """Yield the plan itself, then without its head, then with wavelets instead of own bases."""
-    settings = coding_plan.settings
     yield coding_plan
-    if settings.head is not None:
-        settings = replace(settings, head=None)
-        yield replace(coding_plan, settings=settings)
+    if coding_plan.plain is not None:
+        coding_plan = coding_plan.plain
+        yield coding_plan
+    settings = coding_plan.settings
     if any(axis.basis is not None for axis in settings.transform.axes):
         transform = usual_transform(coding_plan.blocks.tile)
         yield replace(coding_plan, settings=replace(settings, transform=transform))

@@ -1,218 +1,308 @@
-"""Choice of the head: whether it is worth its bytes, and its training in rounds."""
+"""Joint training of the table and of the MLP behind it: whether, how long, and what it saves.
+
+The MLP (`NeighbourHead`) learns what coded values lack; the values are then coded less by what it
+adds, it learns from these, and so on. The pass that saves most is kept, or none.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from threading import Event
+from dataclasses import replace
+from math import prod
 from typing import NamedTuple
 
+import numpy as np
+
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
-from fhash_codec.compact.goal import AIM, EXCHANGE, find_step, step_after_gain
+from fhash_codec.compact.goal import MAX_SLOPE, MIN_SLOPE, find_step, step_after_gain
 from fhash_codec.compact.head_training import (
+    BATCH_VOXELS,
     Budget,
     Pair,
-    Shape,
     TrainedHead,
     train_head,
+    weights_of,
 )
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Coding, Outcome, measured, total
+from fhash_codec.compact.tiles import Coding, Outcome, Tile, measured, total
 from fhash_codec.compact.transform import scale_of
-from fhash_codec.progress import Parts, skip, stage
-from fhash_formats.support.threads import at_most, usable_threads
+from fhash_codec.progress import skip, stage
+from fhash_formats.support.values import Single
 from fhash_formats.transform.head import NeighbourHead
-from fhash_formats.transform.tile import CodedTile
+from fhash_formats.transform.tile import CodedTile, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import cast
 
-PERCEPTRON = Shape((12, 8), cross=False)
-"""Head without a cross: where little is to be gained, its fewer weights may win."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Effort:
-    """Effort that is spent on the choice of a head."""
-
-    candidates: int
-    """Number of the first entries of GAIN_BY_WIDTHS that are considered; 0 for no cross."""
-    budget: Budget | None
-    """Training of a head with a cross; None for none."""
-    perceptron: Budget
-    """Training of the perceptron, whose updates cost a sixth."""
-
-    def budget_of(self, shape: Shape) -> Budget:
-        """Return the training of a head of a shape."""
-        if not shape.cross:
-            return self.perceptron
-        assert self.budget is not None
-        return self.budget
-
-
-GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
-"""Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
-EFFORTS = {
-    5: Effort(
-        candidates=0,
-        budget=None,
-        perceptron=Budget(updates=1000, samples=400_000, rate=3e-2),
-    ),
-    **{
-        effort: Effort(
-            candidates=candidates,
-            budget=Budget(updates=updates, samples=400_000),
-            perceptron=Budget(updates=2 * updates, samples=800_000),
-        )
-        for effort, candidates, updates in (
-            *((6, 4, 5000), (7, 4, 8000)),
-            *((8, 5, 12000), (9, 5, 20000)),
-        )
-    },
-}
-"""Effort spent on heads by the effort of the encoder; below 5 there is no head.
-
-At 5 a cross is left out: it gains up to a fifth more, and takes six times as long.
-"""
-LEAST_GAIN = 0.1
-"""Gain in dB of least squares below which no head is trained."""
-GAIN_OF_HEAD = 1.6
-"""Gain of a head as a multiple of that of least squares: 1.6 to 1.9 on three series."""
-MAX_OF_TRIAL = 1.5
-"""Largest gain of a perceptron as a multiple of that expected of the trial head."""
-LIKELY_OF_TRIAL = (0.85, 1.1)
-"""Such multiples that nearly all gains of perceptrons lie between."""
+GAIN_BY_WIDTHS = {(12, 8): 1.0, (24, 16): 1.2, (48, 16): 1.35}
+"""Gain in dB of an MLP by the widths of its hidden layers, as a multiple of that of the first."""
+MOST_WIDTHS = {"fast": 1, "balanced": 2, "small": 3}
+"""How many of these are considered, by the wish for access: decoding takes 5, 13 and 25 ns more for
+each vertex (AVX-512; 8, 20 and 45 with AVX2), where SPERR takes some 40."""
+LEAST_GAIN = 0.25
+"""Gain in dB of least squares below which nothing is trained: below it, at 0.15, a training saved 1
+to 3 % in twice the seconds; above it, from 0.6 on, 10 to 40 %."""
+GAIN_OF_MLP = 1.6
+"""Gain of the narrowest as a multiple of that of least squares: 1.6 to 1.9 on three series."""
 MOST_EXCESS = 6.0
-"""dB above the promise that a head is credited with at most, since no such step was tried."""
-AT_ONCE = 2
-"""Heads that are trained side by side, at most."""
+"""dB above the promise that an MLP is credited with at most, since no such step was tried."""
 WEIGHT_BYTES = 0.7
-"""Bytes that each weight of a head adds to the file."""
-HEAD_BYTES = 60
-"""Bytes that a head adds to the file besides its weights: its history and description."""
-WEIGHT_TIME = 5e-6
-"""Share of the file that each weight must save to pay for the decoding time it costs."""
+"""Bytes that each weight adds to the file."""
+MLP_BYTES = 60
+"""Bytes that an MLP adds to the file besides its weights: its history and description."""
+TRAINING_NS = 0.12
+"""Nanoseconds of a product in training."""
+JOINT = 1.2
+"""Part of the MLP's correction that values are coded less by: it counts on what it has yet to
+learn. 1 saves up to 1 % less, 1.5 diverges in the third pass."""
+PASSES = 2
+"""Trainings at most, each on what the one before left."""
+AGAIN = 0.3
+"""Updates of each further training, as a share of those of the first."""
+UPDATES = 1000
+"""Updates of the first training at effort 5; twice as many at each further effort."""
+VERTICES_OF_UPDATE = 1500
+"""Vertices of a series for each of these updates, at least: a short series trains shortly."""
+LEAST_UPDATES = 300
+"""Updates of the first training at least: fewer teach nothing."""
+TRIED = 1 << 20
+"""Vertices of the tiles that are coded with steps under a bound, unless one has more."""
+SAMPLES = 400_000
+"""Vertices that are learned from: what few teach, often repeated, holds for few."""
+RATE = 3e-2
+"""Highest learning rate of the first training, up to UPDATES; a longer one learns more slowly."""
+RATE_AGAIN = 1e-2
+"""Highest learning rate of further trainings and of long ones."""
+MOST_AHEAD = 1.1
+"""Factor by which a step is larger at most for what is coded with the MLP of the last pass."""
+AIM_OF_MLP = 0.06
+"""dB above the promise that a step is for: half of the steps would miss it else."""
+FAR = 0.4
+"""dB from the promise from which on the next pass is coded with another step."""
+OCTAVE = 8.5
+"""dB that an octave of bytes buys where an MLP saves some: 8 to 9.6 on four series, of few bits."""
+
+Widths = tuple[int, int]
 
 
-def likely_heads(size: float, gain: float, octave: float, effort: Effort) -> list[Shape]:
-    """Return the heads that are worth a training; none where none should save anything.
-
-    That with a cross and the perceptron are both trained where nothing but a training says which of
-    them saves more.
+def likely_widths(size: float, gain: float, access: str) -> Widths:
+    """Return the widths that should save the most bytes.
 
     size: bytes of the coded tiles.
-    gain: expected gain in dB of a head with a cross of widths (8, 8).
-    octave: dB that an octave of bytes buys.
+    gain: expected gain in dB of the first of `GAIN_BY_WIDTHS`.
+    access: the wish, a name of `MOST_WIDTHS`.
     """
-    if not effort.candidates:
-        saves = _saved(PERCEPTRON, size, gain, octave)
-        return [PERCEPTRON] if saves > 0 else []
 
-    def saved(widths: tuple[int, int]) -> float:
-        return _saved(Shape(widths, cross=True), size, GAIN_BY_WIDTHS[widths] * gain, octave)
+    def saved(of: Widths) -> float:
+        share = 1 - 2 ** (-GAIN_BY_WIDTHS[of] * gain / OCTAVE)
+        return size * share - WEIGHT_BYTES * weights_of(of)
 
-    widths = max(list(GAIN_BY_WIDTHS)[: effort.candidates], key=saved)
-    if saved(widths) <= 0:
-        most = _saved(PERCEPTRON, size, MAX_OF_TRIAL * gain, octave)
-        return [PERCEPTRON] if most > 0 else []
-    with_cross = Shape(widths, cross=True)
-    least, most = (_saved(PERCEPTRON, size, ratio * gain, octave) for ratio in LIKELY_OF_TRIAL)
-    if least >= saved(widths):
-        return [PERCEPTRON]
-    return [with_cross] if most <= saved(widths) else [with_cross, PERCEPTRON]
+    return max(list(GAIN_BY_WIDTHS)[: MOST_WIDTHS[access]], key=saved)
 
 
-def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
-    """Return the bytes that a head of this gain in dB saves, less those that it takes."""
-    share = 1 - 2 ** (-gain / octave) - WEIGHT_TIME * shape.weights
-    return size * share - WEIGHT_BYTES * shape.weights - HEAD_BYTES
+def expected_share(foretold: float) -> float:
+    """Return the bytes with an MLP as a multiple of those without.
 
-
-TRAINING_VERTICES = 24 << 20
-"""Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
+    foretold: gain in dB of least squares.
+    """
+    return float(2 ** (-GAIN_OF_MLP * GAIN_BY_WIDTHS[24, 16] * foretold / OCTAVE))
 
 
 class ChosenHead(NamedTuple):
-    """Settings with a head and their step, and what all tiles should take.
+    """Settings and coding with an MLP, and what all tiles should take.
 
     They are without one where it does not pay; its training is told all the same.
     """
 
     settings: TileSettings
+    coding: Coding
     outcome: Outcome
     history: HeadHistory
 
 
-class _Candidate(NamedTuple):
-    """A trained head, and what the tiles take with it at the step that it was trained for."""
+class _Pass(NamedTuple):
+    """An MLP, and what tiles of a sample take that were coded jointly with it."""
 
     trained: TrainedHead
-    outcome: Outcome
+    psnr: float
+    """PSNR of the sample in dB."""
+    step: float
+    """Step of all tiles that should keep the promise."""
+    share: float
+    """Bytes as a multiple of those without an MLP, at the same error."""
+    joint: float
+    """Part of its correction that values are coded less by."""
 
-    @property
-    def own_bytes(self) -> int:
-        """Bytes that the head adds to the file."""
-        return len(self.trained.head.to_bytes()) + HEAD_BYTES
+
+def own_bytes(trained: TrainedHead) -> int:
+    """Return the bytes that an MLP adds to the file."""
+    return len(trained.head.to_bytes()) + MLP_BYTES
 
 
-def choose_head(task: PlanTask, attempt: Attempt, foretold: float) -> ChosenHead | None:
-    """Return a head with the step that keeps the promise; None where none was trained.
+def choose_head(
+    task: PlanTask, attempt: Attempt, learned: Sample, foretold: float
+) -> ChosenHead | None:
+    """Return an MLP with the step that keeps the promise; None where none was trained.
 
-    A head is trained on what it will meet, coarser data, which it lifts to the promise. Since it
-    changes no stream, one coding tells what it gains.
+    It is trained on what it will meet, coarser data, which it lifts to the promise.
 
-    attempt: without a head; its sample is learned from.
+    attempt: without one.
+    learned: tiles that are learned from.
     foretold: gain in dB of least squares.
     """
-    goal, settings, spent = task.goal, attempt.settings, EFFORTS[task.config.effort]
-    gain = GAIN_OF_HEAD * foretold
-    shapes = likely_heads(attempt.outcome.size, gain, EXCHANGE, spent)
-    if not shapes:
-        skip("head", f"least squares gain {foretold:.2f} dB: no head would save enough")
-        return None
-    with stage("head", f"at effort {task.config.effort}; least squares gain {foretold:.2f} dB"):
-        sample = attempt.sample.wider(TRAINING_VERTICES)
-        coarser = replace(settings, step=_step_below(attempt, settings.step, gain))
-        pairs = training_pairs(sample, coarser, attempt.coding)
-
-        def train(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
-            low, high, budget = settings.low, settings.high, spent.budget_of(shape)
-            return train_head(pairs, low, high, shape, budget, seed=task.config.seed, progress=tell)
-
-        heads = [head for head in _side_by_side(shapes, train, task.parts) if head is not None]
-        if goal.psnr is None:
-            return _at_bound(task, attempt, heads, coarser)
-        # The run that the pairs are of, which is not done again.
-        plain = sample.run(replace(coarser, mask=None), attempt.coding)
-        found = [
-            _Candidate(trained, _corrected(attempt, sample, pairs, trained.head))
-            for trained in heads
-        ]
-
-        def extra(candidate: _Candidate) -> float:
-            gain = candidate.outcome.psnr(goal.data_range) - plain.psnr(goal.data_range)
-            return candidate.own_bytes + plain.size * (1 - 2 ** (gain / EXCHANGE))
-
-        best = min(found, key=extra, default=None)
+    settings, size = attempt.settings, attempt.outcome.size
+    widths = likely_widths(size, GAIN_OF_MLP * foretold, task.config.access)
+    updates, passes = training_length(task, widths)
+    with stage("head", f"{updates} updates, {passes} passes; least squares gain {foretold:.2f} dB"):
+        gain = max(GAIN_OF_MLP * foretold * GAIN_BY_WIDTHS[widths], LEAST_GAIN)
+        done = _trained(task, attempt, learned, widths, gain)
+        best = min(done, key=lambda each: each.share, default=None)
         if best is None:
             return None
-        history = _history(best, goal.data_range)
-        if extra(best) >= 0:
-            return ChosenHead(settings, attempt.outcome, history)
-        # Without an error left, the PSNR is infinite.
-        more = min(best.outcome.psnr(goal.data_range) - goal.psnr - AIM, MOST_EXCESS)
-        step = _step_below(attempt, coarser.step, more)
-        size = round(plain.size * 2 ** (-more / EXCHANGE))
+        history = _history(done)
+        plain = ChosenHead(settings, attempt.coding, attempt.outcome, history)
+        if task.goal.psnr is None:
+            return _at_bound(task, attempt, learned, best, plain)
+        left = size * best.share + own_bytes(best.trained)
+        if left >= size:
+            return plain
         return ChosenHead(
-            replace(settings, head=best.trained.head, step=step),
-            replace(attempt.outcome, size=size),
+            replace(settings, head=best.trained.head, step=best.step),
+            replace(attempt.coding, aim=0.0, joint=best.joint),
+            replace(attempt.outcome, size=round(left)),
             history,
         )
 
 
+def training_length(task: PlanTask, widths: Widths) -> tuple[int, int]:
+    """Return the updates of the first training, and the number of trainings.
+
+    Counted work turns seconds into updates, so that no clock changes a byte.
+    """
+    seconds = task.config.training_seconds
+    if seconds is None:
+        short = prod(task.blocks.shape) // VERTICES_OF_UPDATE
+        updates = max(min(short, UPDATES), LEAST_UPDATES) << (task.config.effort - 5)
+        return updates, PASSES
+    of_update = 1e-9 * TRAINING_NS * weights_of(widths) * BATCH_VOXELS
+    updates = seconds / of_update / (1 + AGAIN * (PASSES - 1))
+    return max(1, round(updates)), PASSES
+
+
+def _trained(
+    task: PlanTask, attempt: Attempt, parts: Sample, widths: Widths, gain: float
+) -> list[_Pass]:
+    """Train and code in turns; what each pass saves. Empty where there is nothing to learn.
+
+    gain: expected of the MLP, in dB.
+    """
+    data_range, at = task.goal.data_range, replace(attempt.settings, mask=None)
+    coding = replace(attempt.coding, aim=0.0, passes=1, rounds=0)
+    coarser = replace(at, step=_step_below(attempt, at.step, gain))
+    trained, done, before = None, list[_Pass](), 0.0
+    slope = min(max(gain / math.log(coarser.step / at.step), MIN_SLOPE), MAX_SLOPE)
+    alone = _Coded.of(parts, coarser, coding)
+    promise = (task.goal.psnr or alone.psnr(data_range) + gain) + AIM_OF_MLP
+    if task.goal.psnr is not None and not parts.complete:  # their PSNR is not that of all tiles
+        promise = parts.run(at, attempt.coding).psnr(data_range) + AIM_OF_MLP
+    updates, count = training_length(task, widths)
+    lengths = [updates if number == 0 else max(1, round(AGAIN * updates)) for number in range(count)]
+    for number, length in enumerate(lengths):
+        coded = alone if trained is None else _left_to(trained.head, parts, alone)
+        trained = train_head(
+            coded.pairs,
+            coarser.low,
+            coarser.high,
+            widths,
+            Budget(
+                updates=length,
+                samples=SAMPLES,
+                rate=RATE if number == 0 and updates <= UPDATES else RATE_AGAIN,
+            ),
+            seed=task.config.seed + number,
+            progress=_report(task, sum(lengths[:number]), length, sum(lengths)),
+            start=trained,
+        )
+        if trained is None:
+            break
+        psnr = _corrected(parts, coded, trained).psnr(data_range)
+        gained = psnr - alone.psnr(data_range)
+        share = coded.size / max(alone.size, 1) * 2 ** (-gained / OCTAVE)
+        excess = min(psnr - promise, MOST_EXCESS)
+        step = coarser.step * math.exp(excess / slope)
+        # What is coded with the MLP of a pass is learned by the next one: it gains as much again.
+        better = step * min(max(step / before, 1.0), MOST_AHEAD) if before else step
+        before = step
+        done.append(_Pass(trained, psnr, better, share, JOINT if number else 0.0))
+        if abs(excess) > FAR and number + 1 < count:
+            coarser = replace(coarser, step=step)
+            alone = _Coded.of(parts, coarser, coding)
+    return done
+
+
+class _Coded(NamedTuple):
+    """Parts as they were coded, without an MLP or less what one adds."""
+
+    pairs: list[Pair]
+    size: int
+    """Bytes of all tiles."""
+    outcome: Outcome
+    settings: TileSettings
+    coding: Coding
+
+    @classmethod
+    def of(cls, parts: Sample, settings: TileSettings, coding: Coding) -> _Coded:
+        """Code parts without an MLP."""
+        pairs = training_pairs(parts, settings, coding)
+        outcome = parts.run(settings, coding)  # they were coded so for the pairs
+        return cls(pairs, outcome.size, outcome, settings, coding)
+
+    def psnr(self, data_range: float) -> float:
+        """Return the PSNR without an MLP in dB."""
+        return self.outcome.psnr(data_range)
+
+
+def _left_to(head: NeighbourHead, parts: Sample, alone: _Coded) -> _Coded:
+    """Return parts that are coded less by what an MLP adds to them.
+
+    It is what the coder does with an MLP (native/encode.cpp, leave_to_head).
+
+    alone: the parts coded without one.
+    """
+
+    def coded(pair: Pair) -> CodedTile:
+        with np.errstate(over="ignore", invalid="ignore"):
+            less = np.float32(JOINT) * (head.apply(pair.decoded) - pair.decoded)
+            values = pair.original.astype(np.float32) - less
+        return encode_tile(values, alone.settings, alone.coding, in_coreset=pair.counted)
+
+    tiles = list(map(coded, alone.pairs))
+    pairs = [
+        pair._replace(decoded=tile.decoded) for pair, tile in zip(alone.pairs, tiles, strict=True)
+    ]
+    sizes = (len(tile.data) * weight for tile, weight in zip(tiles, parts.weights, strict=True))
+    return alone._replace(pairs=pairs, size=sum(sizes))
+
+
+def _corrected(parts: Sample, coded: _Coded, trained: TrainedHead) -> Outcome:
+    """Return the error of coded parts with an MLP."""
+
+    def corrected(job: tuple[Pair, Tile]) -> Outcome:
+        pair, tile = job
+        values = cast(trained.head.apply(pair.decoded), tile.values.dtype)
+        decoded = CodedTile(data=b"", decoded=values, nonzero=0)
+        return measured(tile, decoded, coded.settings, coded.coding)
+
+    return total(list(map(corrected, zip(coded.pairs, parts.tiles, strict=True))), parts.weights)
+
+
+def _report(task: PlanTask, before: int, length: int, total: int) -> Callable[[float], None]:
+    """Return what reports a training of some updates among all, by the share that is done of it."""
+    return lambda share: task.parts.report("training", (before + share * length) / total)
+
+
 def _step_below(attempt: Attempt, step: float, decibels: float) -> float:
-    """Return the step whose PSNR without a head is lower than that of a step.
+    """Return the step whose PSNR without an MLP is lower than that of a step.
 
     Coefficients predict it, where there is a promised PSNR.
     """
@@ -222,94 +312,42 @@ def _step_below(attempt: Attempt, step: float, decibels: float) -> float:
     return attempt.magnitudes.step_of(error, attempt.settings)
 
 
-def _corrected(
-    attempt: Attempt, sample: Sample, pairs: Sequence[Pair], head: NeighbourHead
-) -> Outcome:
-    """Return the error of decoded tiles with a head."""
-    outcomes = []
-    for pair, tile in zip(pairs, sample.tiles, strict=True):
-        values = cast(head.apply(pair.decoded), tile.values.dtype)
-        coded = CodedTile(data=b"", decoded=values, nonzero=0)
-        outcomes.append(measured(tile, coded, attempt.settings, attempt.coding))
-    return total(outcomes, sample.weights)
-
-
 def _at_bound(
-    task: PlanTask, attempt: Attempt, heads: Sequence[TrainedHead], coarser: TileSettings
-) -> ChosenHead | None:
-    """Return the head of the fewest bytes under a bound, which all tiles keep at any step.
-
-    Parts tell which step costs least.
-    """
-    assert attempt.parts is not None
-    assert attempt.moved is not None
-    coding, best, least = attempt.coding, None, attempt.outcome.size
-    for trained in heads:
-        of_parts = replace(coarser, head=trained.head, transform=attempt.moved.transform)
-        found, _ = find_step(attempt.parts, of_parts, coding, task.goal, tries=3)
-        settings = replace(found, transform=coarser.transform)
-        outcome = attempt.sample.run(settings, task.goal.bounded(coding))
-        candidate = _Candidate(trained, outcome)
-        history = _history(candidate, task.goal.data_range)
-        if outcome.size + candidate.own_bytes < least:
-            least = outcome.size + candidate.own_bytes
-            best = ChosenHead(settings, outcome, history)
-        elif best is None:
-            best = ChosenHead(attempt.settings, attempt.outcome, history)
-    return best
+    task: PlanTask, attempt: Attempt, learned: Sample, best: _Pass, plain: ChosenHead
+) -> ChosenHead:
+    """Return an MLP at the step of the fewest bytes under a bound; `plain` where it saves none."""
+    joint = replace(attempt.coding, aim=0.0, joint=best.joint)
+    few = learned.narrower(TRIED)
+    before = few.run(attempt.settings, task.goal.bounded(attempt.coding))
+    trained = replace(attempt.settings, head=best.trained.head, step=best.step)
+    settings, outcome = find_step(few, trained, joint, task.goal, tries=3)
+    size = attempt.outcome.size * outcome.size / before.size + own_bytes(best.trained)
+    if size >= attempt.outcome.size:
+        return plain
+    return ChosenHead(settings, joint, replace(attempt.outcome, size=round(size)), plain.history)
 
 
-def _history(candidate: _Candidate, data_range: float) -> HeadHistory:
-    """Return the training of a candidate, as the file has it."""
-    trained = candidate.trained
-    psnr_without = candidate.outcome.psnr(data_range) - trained.gain_db
-    return [
-        {
-            "seconds": seconds,
-            "epoch": update,
-            # The header holds no infinity: that of values without an error.
-            "psnr": psnr if math.isfinite(psnr := psnr_without + gain) else None,
-            "samples": trained.samples,
-        }
-        for seconds, update, gain in trained.history
-    ]
-
-
-def _side_by_side(
-    shapes: Sequence[Shape],
-    train: Callable[[Shape, Callable[[float], None]], TrainedHead | None],
-    parts: Parts,
-) -> list[TrainedHead | None]:
-    """Train heads in threads, AT_ONCE at a time.
-
-    train: trains a head and tells the share that is done to its second argument.
-    parts: progress of the planning.
-    """
-    shares, stopped = dict.fromkeys(shapes, 0.0), Event()
-    threads = max(1, usable_threads() // min(len(shapes), AT_ONCE))
-
-    def run(shape: Shape) -> TrainedHead | None:
-        def tell(share: float) -> None:
-            if stopped.is_set():
-                raise CancelledError  # ends this thread where the other or the user stopped it
-            shares[shape] = share
-
-        with at_most(threads):
-            trained = train(shape, tell)
-        tell(1.0)
-        return trained
-
-    with ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fhash-head") as workers:
-        works = [workers.submit(run, shape) for shape in shapes]
-        try:
-            parts.wait(works, "training", lambda: sum(shares.values()) / len(shares))
-            return [work.result() for work in works]
-        finally:
-            stopped.set()
+def _history(passes: Sequence[_Pass]) -> HeadHistory:
+    """Return the training, as the file has it."""
+    history, seconds, updates = HeadHistory(), 0.0, 0
+    for each in passes:
+        of_pass = each.trained.history
+        history += [
+            {
+                "seconds": seconds + after,
+                "epoch": updates + update,
+                # The header holds no infinity: that of values without an error.
+                "psnr": each.psnr + gain - of_pass[-1][2] if math.isfinite(each.psnr) else None,
+                "samples": each.trained.samples,
+            }
+            for after, update, gain in of_pass
+        ]
+        seconds, updates = seconds + of_pass[-1][0], updates + of_pass[-1][1]
+    return history
 
 
 def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
-    """Return the tiles as they decode without a head, with their originals and masks."""
+    """Return the tiles as they decode without an MLP, with their originals and masks."""
     decoded = sample.decoded(replace(settings, head=None, mask=None), coding)
     return [
         Pair(values, tile.values, tile.counted)

@@ -17,7 +17,6 @@ from fhash_codec.measure.errors import pointer
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.support.values import Double, Single
 from fhash_formats.transform.head import (
-    CROSS,
     INPUTS,
     MAX_BIAS,
     MAX_WEIGHT,
@@ -26,7 +25,6 @@ from fhash_formats.transform.head import (
     Layer,
     NeighbourHead,
     Scaled,
-    layer_inputs,
 )
 from fhash_formats.transform.spec import checked
 
@@ -77,7 +75,7 @@ class Batches:
     """Batches of n = blocks * BLOCK_VOXELS voxels."""
 
     inputs: npt.NDArray[np.int16]
-    """Inputs of the network (batches, blocks, INPUTS, voxels looked at, BLOCK_VOXELS)."""
+    """Inputs of the network (batches, blocks, INPUTS, BLOCK_VOXELS)."""
     targets: npt.NDArray[np.int32]
     """Original minus decoded values (batches, n), in units of sigma / ERROR_UNIT."""
     lowest: npt.NDArray[np.int32]
@@ -88,16 +86,11 @@ class Batches:
     def __len__(self) -> int:
         return len(self.targets)
 
-
-def count_voxels(pairs: Sequence[Pair]) -> npt.NDArray[np.int64]:
-    """Return the number of voxels that count in each tile."""
-    return np.array(
-        [
-            pair.original.size if pair.counted is None else np.count_nonzero(pair.counted)
-            for pair in pairs
-        ],
-        dtype=np.int64,
-    )
+    def part(self, first: int, last: int | None) -> Batches:
+        """Return some of the batches."""
+        arrays = (self.inputs, self.targets, self.lowest, self.highest)
+        inputs, targets, lowest, highest = (array[first:last] for array in arrays)
+        return Batches(inputs=inputs, targets=targets, lowest=lowest, highest=highest)
 
 
 def draw(
@@ -107,16 +100,29 @@ def draw(
     low: np.float32,
     high: np.float32,
 ) -> list[Voxels]:
-    """Draw voxels that count, from each tile according to its number of them.
+    """Draw voxels that count, each as often as the size of its error and the mean one add up to.
 
-    At least one must count.
+    Most of the squared error, and of the bytes, is where few voxels are: drawn alike, these would
+    hardly be learned from. Without a voxel that counts, none are drawn.
     """
-    counts = count_voxels(pairs)
-    ends = np.rint(np.cumsum(counts) / counts.sum() * samples).astype(np.int64)
+    errors = [_magnitudes(pair) for pair in pairs]
+    total = sum(float(error.sum(dtype=np.float64)) for error in errors)
+    count = sum(
+        error.size if pair.counted is None else np.count_nonzero(pair.counted)
+        for error, pair in zip(errors, pairs, strict=True)
+    )
+    mean = np.float32(total / count) if count else np.float32(0)
+    for pair, error in zip(pairs, errors, strict=True):
+        error += mean if mean > 0 else np.float32(1)
+        if pair.counted is not None:
+            error *= pair.counted
+    sums = [np.cumsum(error, dtype=np.float64) for error in errors]
+    ends = np.cumsum([each[-1] for each in sums])
+    ends = np.rint(ends / (ends[-1] or 1.0) * samples).astype(np.int64) if count else ends * 0
     drawn = []
-    for pair, number in zip(pairs, np.diff(ends, prepend=0), strict=True):
-        among = pair.original.size if pair.counted is None else np.flatnonzero(pair.counted)
-        chosen = np.sort(random.choice(among, number)) if number else np.empty(0, np.int64)
+    for pair, sums_of, number in zip(pairs, sums, np.diff(ends, prepend=0), strict=True):
+        at = np.sort(random.random(int(number))) * sums_of[-1]
+        chosen = np.searchsorted(sums_of, at, side="right")
         places = np.stack(np.unravel_index(chosen, pair.original.shape))
         values = pair.decoded.ravel()[chosen]
         values = np.where(values > low, values, low)  # NaN becomes low, as the head has it
@@ -125,28 +131,32 @@ def draw(
     return drawn
 
 
+def _magnitudes(pair: Pair) -> Single:
+    """Return the magnitude of the error of each voxel, float32; 0 where none counts."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(pair.original.astype(np.float32) - pair.decoded)
+    error[~np.isfinite(error)] = 0
+    return error if pair.counted is None else error * pair.counted
+
+
 def batches(
     pairs: Sequence[Pair],
     drawn: Sequence[Voxels],
-    offsets: Sequence[tuple[int, ...]],
     random: np.random.Generator,
     value_range: ErrorRange,
 ) -> Batches:
-    """Return the drawn voxels in random order, as the network sees them.
-
-    offsets: places, relative to a voxel, of the voxels whose inputs are computed.
-    """
+    """Return the drawn voxels in random order, as the network sees them."""
     low, high, sigma = value_range.low, value_range.high, value_range.sigma
     values = np.concatenate([voxels.values for voxels in drawn])
     originals = np.concatenate([voxels.originals for voxels in drawn])
     order = random.permutation(len(values))
     count = len(values) // BATCH_VOXELS
     blocks = BATCH_VOXELS // BLOCK_VOXELS
-    inputs = np.empty((count * blocks, INPUTS, len(offsets), BLOCK_VOXELS), dtype=np.int16)
+    inputs = np.empty((count * blocks, INPUTS, BLOCK_VOXELS), dtype=np.int16)
     first = 0
     for pair, voxels in zip(pairs, drawn, strict=True):
         slots = order[first : first + len(voxels.values)]
-        _fill_slots(inputs, slots, pair.decoded, voxels.places, offsets, value_range)
+        _fill_slots(inputs, slots, pair.decoded, voxels.places, value_range)
         first += len(slots)
 
     def batched(unordered: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
@@ -169,12 +179,11 @@ def _fill_slots(
     slots: npt.NDArray[np.int64],
     decoded: Single,
     places: npt.NDArray[np.int64],
-    offsets: Sequence[tuple[int, ...]],
     value_range: ErrorRange,
 ) -> None:
     """Write the inputs of voxels of a tile into their slots.
 
-    inputs: of all voxels, (blocks, INPUTS, offsets, BLOCK_VOXELS).
+    inputs: of all voxels, (blocks, INPUTS, BLOCK_VOXELS).
     slots: number of each of the n voxels of this tile among all voxels.
     places: coordinates (4, n) of the voxels.
     """
@@ -187,12 +196,11 @@ def _fill_slots(
         np.ascontiguousarray(places[:, order], np.int64),
         np.ascontiguousarray(slots[order], np.int64),
         np.array(OFFSETS, np.int64),
-        np.array(offsets, np.int64),
     )
-    tile, shape, at, to, neighbours, seen = map(pointer, arrays)
+    tile, shape, at, to, neighbours = map(pointer, arrays)
     code = checked(
         native.library().fhash_head_inputs(
-            *(tile, shape, at, to, len(slots), neighbours, seen, len(offsets)),
+            *(tile, shape, at, to, len(slots), neighbours),
             *(float(value_range.low), float(value_range.high), float(inverse), float(unit)),
             pointer(inputs),
         )
@@ -232,17 +240,15 @@ class Network:
 
     Attributes:
         widths: outputs of the hidden layers.
-        looked_at: voxels whose first layer the second layer sees: 1, or 9 for a cross.
         parameters: weights (out, in) and biases (out,) of each layer in turn, float64 (n,).
         means: Adam's means of the gradients, likewise.
         squares: Adam's means of the squared gradients, likewise.
     """
 
-    def __init__(self, widths: tuple[int, int], looked_at: int, random: np.random.Generator):
+    def __init__(self, widths: tuple[int, int], random: np.random.Generator):
         """Begin with uniform random numbers; the last layer begins near 0."""
-        self.widths, self.looked_at = widths, looked_at
-        rows = [*widths, 1]
-        columns = layer_inputs(widths, cross=looked_at > 1)
+        self.widths = widths
+        rows, columns = (*widths, 1), (INPUTS, *widths)
         parts = []
         for number, (out, count) in enumerate(zip(rows, columns, strict=True)):
             reach = 1 / np.sqrt(np.float64(count))
@@ -296,8 +302,7 @@ class Network:
     def layers(self) -> tuple[Layer, ...]:
         """Return the layers as the file holds them."""
         layers, at = [], 0
-        columns = (INPUTS, self.widths[0] * self.looked_at, self.widths[1])
-        for inputs, outputs in zip(columns, (*self.widths, 1), strict=True):
+        for inputs, outputs in zip((INPUTS, *self.widths), (*self.widths, 1), strict=True):
             end = at + outputs * inputs
             weights = self.parameters[at:end].reshape(outputs, inputs)
             biases = self.parameters[end : end + outputs]
@@ -307,9 +312,8 @@ class Network:
 
     def _arguments(self, voxels: Batches) -> Sequence[ctypes.c_void_p]:
         """Return the arguments of the native functions that describe the voxels."""
-        batches, blocks, _, looked_at, block = voxels.inputs.shape
-        assert looked_at == self.looked_at
-        sizes = (ctypes.c_int64 * 6)(batches, blocks, block, looked_at, *self.widths)
+        batches, blocks, _, block = voxels.inputs.shape
+        sizes = (ctypes.c_int64 * 5)(batches, blocks, block, *self.widths)
         arrays = voxels.inputs, voxels.targets, voxels.lowest, voxels.highest
         assert all(array.flags.c_contiguous for array in arrays)
         addresses = [pointer(array) for array in arrays]
@@ -335,7 +339,7 @@ WARM_UP = 0.1
 """Share of the schedule in which the learning rate rises."""
 ROUNDED_FROM = 0.6
 """Share of the schedule from which on weights are rounded as in the file."""
-STARTS = 3
+STARTS = 2
 """Networks that are trained side by side at first."""
 CHOSEN_AT = 0.15
 """Share of the schedule at which the best of them goes on alone."""
@@ -356,31 +360,17 @@ class TrainedHead:
     """Gain during the training: (seconds, update, gain in dB)."""
     samples: int
     """Voxels that it learned from."""
+    parameters: Double
+    """Weights and biases before they were rounded, as `Network` has them."""
 
 
-@dataclass(frozen=True)
-class Shape:
-    """Widths of the two hidden layers of a head, and whether it looks at the voxels of a cross."""
+def weights_of(widths: tuple[int, int]) -> int:
+    """Return the number of weights of a head, biases not included.
 
-    widths: tuple[int, int]
-    cross: bool
-
-    @property
-    def weights(self) -> int:
-        """Number of weights, biases not included."""
-        first, second = self.widths
-        return INPUTS * first + self.looked_at * first * second + second
-
-    @property
-    def products(self) -> int:
-        """Multiplications for a voxel in training."""
-        first, second = self.widths
-        return self.looked_at * (INPUTS * first + first * second) + second
-
-    @property
-    def looked_at(self) -> int:
-        """Voxels whose first layer the second layer sees."""
-        return len(CROSS) if self.cross else 1
+    widths: of its two hidden layers.
+    """
+    first, second = widths
+    return INPUTS * first + first * second + second
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -400,11 +390,12 @@ def train_head(
     pairs: Sequence[Pair],
     low: float,
     high: float,
-    shape: Shape,
+    widths: tuple[int, int],
     budget: Budget,
     *,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
+    start: TrainedHead | None = None,
 ) -> TrainedHead | None:
     """Train a head that lowers the squared error of the voxels that count.
 
@@ -413,27 +404,27 @@ def train_head(
 
     pairs: decoded and original tiles (t, z, y, x) in data units.
     low, high: range that decoded values are clipped to.
+    widths: of the hidden layers.
     budget: at least one update; a fifth as many further samples measure the gain.
     progress: called with the share of the training that is done, 0 to 1, after every few updates.
         What it raises ends the training.
+    start: a head of these widths that goes on learning; None for a random start.
     """
-    if not count_voxels(pairs).sum():
-        return None
     random = np.random.default_rng(seed)
     bounds = np.float32(low), np.float32(high)
-    learned, tested = (
-        draw(pairs, max(1, round(count / BATCH_VOXELS)) * BATCH_VOXELS, random, *bounds)
-        for count in (budget.samples, budget.samples // 5)
-    )
-    sigma = _sigma(learned)
+    counts = [max(1, round(n / BATCH_VOXELS)) for n in (budget.samples, budget.samples // 5)]
+    drawn = draw(pairs, sum(counts) * BATCH_VOXELS, random, *bounds)
+    if not any(voxels.values.size for voxels in drawn):
+        return None
+    sigma = _sigma(drawn) if start is None else np.float32(start.head.sigma)
     if not SIGMA_RANGE[0] <= sigma <= SIGMA_RANGE[1]:
         return None
     value_range = ErrorRange(low=bounds[0], high=bounds[1], sigma=sigma)
-    offsets = CROSS if shape.cross else CROSS[:1]
-    training, held_out = (
-        batches(pairs, drawn, offsets, random, value_range) for drawn in (learned, tested)
-    )
-    networks = [Network(shape.widths, len(offsets), random) for _ in range(STARTS)]
+    both = batches(pairs, drawn, random, value_range)
+    training, held_out = both.part(0, counts[0]), both.part(counts[0], None)
+    networks = [Network(widths, random) for _ in range(STARTS if start is None else 1)]
+    if start is not None:
+        networks[0].parameters[:] = start.parameters
     history, network = _optimise(
         networks, training, held_out, _rates(budget.updates, budget.rate), progress
     )
@@ -442,13 +433,13 @@ def train_head(
         sigma=float(sigma),
         low=float(bounds[0]),
         high=float(bounds[1]),
-        cross=shape.cross,
     )
     return TrainedHead(
         head=head,
         gain_db=history[-1][2],
         history=tuple(history),
-        samples=sum(voxels.values.size for voxels in learned),
+        samples=counts[0] * BATCH_VOXELS,
+        parameters=network.parameters,
     )
 
 
@@ -470,22 +461,24 @@ def foretold_gain(pairs: Sequence[Pair], low: float, high: float, seed: int = 0)
     pairs: decoded and original tiles (t, z, y, x) in data units.
     low, high: range that decoded values are clipped to.
     """
-    if not count_voxels(pairs).sum():
-        return 0.0
     random = np.random.default_rng(seed)
     bounds = np.float32(low), np.float32(high)
-    drawn = [draw(pairs, count, random, *bounds) for count in (LOOKED_AT, LOOKED_AT // 2)]
-    sigma = _sigma(drawn[0])
+    drawn = draw(pairs, LOOKED_AT + LOOKED_AT // 2, random, *bounds)
+    if not any(voxels.values.size for voxels in drawn):
+        return 0.0
+    sigma = _sigma(drawn)
     if not SIGMA_RANGE[0] <= sigma <= SIGMA_RANGE[1]:
         return 0.0
     value_range = ErrorRange(low=bounds[0], high=bounds[1], sigma=sigma)
-    learned, tested = (batches(pairs, some, CROSS[:1], random, value_range) for some in drawn)
+    both = batches(pairs, drawn, random, value_range)
+    learned = both.part(0, LOOKED_AT // BATCH_VOXELS)
+    tested = both.part(LOOKED_AT // BATCH_VOXELS, None)
     scale = SPREAD / math.sqrt(INPUTS)
     weights = random.standard_normal((INPUTS, FEATURES)) * scale
     biases = random.standard_normal(FEATURES) * SPREAD
 
     def design(voxels: Batches) -> tuple[Double, Double]:
-        inputs = voxels.inputs[:, :, :, 0].transpose(0, 1, 3, 2).reshape(-1, INPUTS) / 512.0
+        inputs = voxels.inputs.transpose(0, 1, 3, 2).reshape(-1, INPUTS) / 512.0
         features = np.maximum(inputs @ weights + biases, 0.0)
         targets = np.clip(voxels.targets, -MAX_ERROR, MAX_ERROR).reshape(-1) / ERROR_UNIT
         return np.concatenate([inputs, features, np.ones((len(inputs), 1))], axis=1), targets

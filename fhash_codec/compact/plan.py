@@ -90,6 +90,10 @@ class CodingPlan:
     size: float | None = None
     """Bytes that the tiles are likely to take: infinite where the sample missed the promise, None
     where nothing was tried."""
+    plain: CodingPlan | None = None
+    """The plan without an MLP, where this one has one."""
+    in_doubt: bool = False
+    """Whether it is not sure that the MLP saves bytes."""
     keeps_decoded: bool = False
     """Whether all tiles are kept as they decode, to be measured without being decoded again."""
 
@@ -232,6 +236,8 @@ def _plan_of(task: PlanTask, attempt: Attempt, *, labels: bool) -> CodingPlan:
         gains=task.gains.entries,
         history=attempt.history,
         tiling=attempt.tiling,
+        plain=None if attempt.plain is None else _plan_of(task, attempt.plain, labels=labels),
+        in_doubt=attempt.in_doubt,
         size=attempt.outcome.size if _keeps_promise(task, attempt.outcome) else math.inf,
         keeps_decoded=small and not coded,
     )

@@ -208,13 +208,11 @@ class Sample:
         """Settings and density by which the tiles were filled; None for tiles of the source."""
         return self._filling
 
-    def wider(self, max_vertices: int) -> Sample:
-        """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.
+    def narrower(self, max_vertices: int) -> Sample:
+        """Return a sample of fewer tiles, of `max_vertices` together at most, or a single one.
 
-        A sample that has all tiles is returned itself.
+        They are filled in the same way.
         """
-        if self.complete:
-            return self
         other = Sample(self.blocks, max_vertices, self._pool, self._costs, self.tick)
         return other if self._filling is None else other.filled(*self._filling)
 

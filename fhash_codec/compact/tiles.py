@@ -504,11 +504,12 @@ class Run:
     def has_streams_of(self, settings: TileSettings, coding: Coding) -> bool:
         """Whether the tiles would be coded to these streams.
 
-        Without a bound, a head changes what streams decode to and no byte of them.
+        A head changes what streams decode to, but no byte of them without a bound or joint coding.
         """
         if self.coding != coding:
             return False
-        if self.settings.head is not settings.head and coding.error is not None:
+        alone = coding.error is None and not coding.joint
+        if self.settings.head is not settings.head and not alone:
             return False
         return replace(self.settings, head=None) == replace(settings, head=None)
 

@@ -29,7 +29,7 @@ from fhash_codec.compact.goal import (
     step_after,
     with_step,
 )
-from fhash_codec.compact.head import LEAST_GAIN, choose_head, training_pairs
+from fhash_codec.compact.head import LEAST_GAIN, choose_head, expected_share, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
 from fhash_codec.compact.planner import block_of, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
@@ -465,10 +465,11 @@ MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
 
 
-def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Return the plan with a head where coded parts say that one pays."""
-    if not task.asks("head"):
-        return attempt
+def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Attempt:
+    """Return the plan with an MLP where coded parts say that one pays.
+
+    beside: bytes that the tiles take in another way, which it has to save as well.
+    """
     if reason := _without_head(task, attempt):
         skip("head", reason)
         return attempt
@@ -480,15 +481,20 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
         low, high = attempt.settings.low, attempt.settings.high
         gain = foretold_gain(pairs, low, high, task.config.seed)
     # Who wishes for the fewest bytes pays the seconds of a training for little.
-    if gain < (0 if task.config.access == "small" else LEAST_GAIN):
+    asked = task.config.access == "small" or task.config.train != "auto"
+    if gain < (0 if asked else LEAST_GAIN):
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
+    if expected_share(gain) * attempt.outcome.size > beside:
+        skip("head", "predicted values take fewer bytes than it would leave")
+        return attempt
     task.parts.begin("head")
-    if task.goal.psnr is None:
-        attempt = on_all_tiles(task, attempt)
-    elif not attempt.coded:
-        attempt = replace(attempt, sample=tiles_of(task, attempt))
-    found = choose_head(task, replace(attempt, coding=with_fill(attempt.coding)), gain)
+    blocks = attempt.sample.blocks
+    costs = part_costs(task, blocks, attempt.settings)
+    learned = Sample(blocks, LEARNED, task.workers, costs, task.parts.tick)
+    learned = learned.filled(attempt.settings, attempt.coding.density)
+    filled = replace(attempt, coding=with_fill(attempt.coding))
+    found = choose_head(task, filled, learned, gain)
     if found is None or found.settings.head is None:
         task.gains.note("head (left out)", attempt.outcome)
         return attempt if found is None else replace(attempt, history=found.history)
@@ -496,16 +502,21 @@ def with_head(task: PlanTask, attempt: Attempt) -> Attempt:
     return replace(
         attempt,
         settings=found.settings,
+        coding=found.coding,
+        plain=replace(attempt, history=found.history),
+        in_doubt=found.outcome.size > SURE * attempt.outcome.size,
         outcome=found.outcome,
         history=found.history,
-        coded=task.goal.psnr is None,
+        coded=False,
     )
 
 
 def _without_head(task: PlanTask, attempt: Attempt) -> str:
     """Return why no head is to be trained; "" where one is."""
-    goal, effort = task.goal, task.config.effort
-    if effort < MIN_HEAD_EFFORT:
+    goal, effort, train = task.goal, task.config.effort, task.config.train
+    if train == "none":
+        return "--train none"
+    if train == "auto" and effort < MIN_HEAD_EFFORT:
         return f"effort {effort} trains none; from {MIN_HEAD_EFFORT} on"
     if goal.size is not None:
         return "a promised ratio: the step changes once the whole file is known"
@@ -516,8 +527,10 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
     return ""
 
 
-WITH_HEAD = 0.6
-"""Share of the bytes by the transform that no head takes fewer than."""
+LEARNED = 6 << 20
+"""Vertices of the tiles that are learned from, unless a single one has more."""
+SURE = 0.97
+"""Share of the bytes without an MLP up to which nobody doubts that it saves some."""
 
 
 def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -529,10 +542,7 @@ def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
     coding = task.goal.bounded(with_fill(attempt.coding))
     outcome = attempt.sample.run(settings, coding)
     predicted, size = replace(attempt, settings=settings, outcome=outcome), outcome.size
-    if size >= WITH_HEAD * attempt.outcome.size:
-        attempt = with_head(task, attempt)
-    else:
-        skip("head", "predicted values take fewer bytes than it would leave")
+    attempt = with_head(task, attempt, size)
     # What is predicted is read slowly: no reason to give up the fast coder for little.
     share = FAST_BYTES[task.config.access] if attempt.coding.fast else 1.0
     kept = size * share < attempt.outcome.size

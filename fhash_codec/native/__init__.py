@@ -50,7 +50,7 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_gram_{kind}": (*(ARRAY, INTEGER, INTEGER, INTEGER), REAL, ARRAY) for kind in _KINDS},
     # head_inputs.cpp
     "fhash_head_inputs": (
-        *(*(ARRAY,) * 4, INTEGER, ARRAY, ARRAY, INTEGER),
+        *(*(ARRAY,) * 4, INTEGER, ARRAY),
         *(*(REAL,) * 4, ARRAY),
     ),
     # train_head.cpp

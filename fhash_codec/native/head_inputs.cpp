@@ -98,25 +98,18 @@ bool reaches(const int64_t* offsets, int64_t count) {
     return true;
 }
 
-// The drawn voxels of a tile, and the places around each that its inputs look at.
+// The drawn voxels of a tile, and the offsets of their neighbours.
 struct Drawn {
     const float* decoded;
     const int64_t *shape, *places, *slots;
     int64_t count;
-    const int64_t *neighbours, *offsets;
-    int64_t looked_at;
+    const int64_t* neighbours;
 };
 
 // First places of the rows that the inputs of a voxel look at, relative to it.
-std::vector<int64_t> rows_of(const Drawn& drawn, const int64_t* far, const int64_t* strides) {
+std::vector<int64_t> rows_of(const Drawn& drawn, const int64_t* far) {
     std::vector<int64_t> rows;
-    for (int64_t l = 0; l < drawn.looked_at; ++l)
-        for (int k = 0; k < NEIGHBOURS; ++k) {
-            int64_t row = far[k] - drawn.neighbours[k * AXES + 3];
-            for (int axis = 0; axis + 1 < AXES; ++axis)
-                row += drawn.offsets[l * AXES + axis] * strides[axis];
-            rows.push_back(row);
-        }
+    for (int k = 0; k < NEIGHBOURS; ++k) rows.push_back(far[k] - drawn.neighbours[k * AXES + 3]);
     std::sort(rows.begin(), rows.end());
     rows.erase(std::unique(rows.begin(), rows.end()), rows.end());
     return rows;
@@ -125,11 +118,11 @@ std::vector<int64_t> rows_of(const Drawn& drawn, const int64_t* far, const int64
 // Inputs of all voxels. Their places around a voxel are at fixed distances where it is not near an
 // end of the tile.
 FHASH_INLINE void write_inputs(const Drawn& drawn, const Range& range, int16_t* out) {
-    const int64_t *const shape = drawn.shape, looked_at = drawn.looked_at;
+    const int64_t* const shape = drawn.shape;
     const int64_t strides[AXES] = {shape[1] * shape[2] * shape[3], shape[2] * shape[3], shape[3],
                                    1};
     const int64_t own[AXES] = {0, 0, 0, 0};
-    const Farthest near(drawn.neighbours, NEIGHBOURS), seen(drawn.offsets, looked_at);
+    const Farthest near(drawn.neighbours, NEIGHBOURS);
     int64_t far[NEIGHBOURS];
     for (int k = 0; k < NEIGHBOURS; ++k) {
         far[k] = 0;
@@ -137,7 +130,7 @@ FHASH_INLINE void write_inputs(const Drawn& drawn, const Range& range, int16_t* 
             far[k] += drawn.neighbours[k * AXES + axis] * strides[axis];
     }
     const int64_t size = strides[0] * shape[0];
-    const std::vector<int64_t> rows = rows_of(drawn, far, strides);
+    const std::vector<int64_t> rows = rows_of(drawn, far);
     for (int64_t i = 0; i < drawn.count; ++i) {
         if (i + AHEAD < drawn.count) {
             int64_t next = 0;
@@ -147,39 +140,31 @@ FHASH_INLINE void write_inputs(const Drawn& drawn, const Range& range, int16_t* 
                 FHASH_PREFETCH(drawn.decoded + inside(next + row, size));
         }
         int16_t* const slot =
-            out + drawn.slots[i] / BLOCK * INPUTS * looked_at * BLOCK + drawn.slots[i] % BLOCK;
-        int64_t place[AXES];
-        for (int axis = 0; axis < AXES; ++axis) place[axis] = drawn.places[axis * drawn.count + i];
+            out + drawn.slots[i] / BLOCK * INPUTS * BLOCK + drawn.slots[i] % BLOCK;
+        int64_t voxel[AXES], at = 0;
         bool inner = true;  // all that is looked at lies inside the tile
         for (int axis = 0; axis < AXES; ++axis) {
-            const int64_t reach = near.along[axis] + seen.along[axis];
-            inner &= place[axis] >= reach && place[axis] + reach < shape[axis];
+            voxel[axis] = drawn.places[axis * drawn.count + i];
+            at += voxel[axis] * strides[axis];
+            const int64_t reach = near.along[axis];
+            inner &= voxel[axis] >= reach && voxel[axis] + reach < shape[axis];
         }
-        for (int64_t l = 0; l < looked_at; ++l) {
-            int64_t voxel[AXES], at = 0;
-            for (int axis = 0; axis < AXES; ++axis) {
-                voxel[axis] = inside(place[axis] + drawn.offsets[l * AXES + axis], shape[axis]);
-                at += voxel[axis] * strides[axis];
-            }
-            float values[NEIGHBOURS];
-            if (inner) {
-                for (int k = 0; k < NEIGHBOURS; ++k) values[k] = drawn.decoded[at + far[k]];
-            } else {
-                const Around around(voxel, shape, strides);
-                at = around(own);
-                for (int k = 0; k < NEIGHBOURS; ++k)
-                    values[k] = drawn.decoded[around(drawn.neighbours + k * AXES)];
-            }
-            const float centre = range.clipped(drawn.decoded[at]);
-            int16_t inputs[NEIGHBOURS];
+        float values[NEIGHBOURS];
+        if (inner) {
+            for (int k = 0; k < NEIGHBOURS; ++k) values[k] = drawn.decoded[at + far[k]];
+        } else {
+            const Around around(voxel, shape, strides);
+            at = around(own);
             for (int k = 0; k < NEIGHBOURS; ++k)
-                inputs[k] = Range::compressed((range.clipped(values[k]) - centre) * range.inverse);
-            int16_t* const to = slot + l * BLOCK;
-            for (int k = 0; k < NEIGHBOURS; ++k) to[k * looked_at * BLOCK] = inputs[k];
-            to[NEIGHBOURS * looked_at * BLOCK] = range.located(centre);
-            to[(NEIGHBOURS + 1) * looked_at * BLOCK] =
-                Range::compressed((centre - range.low) * range.inverse);
+                values[k] = drawn.decoded[around(drawn.neighbours + k * AXES)];
         }
+        const float centre = range.clipped(drawn.decoded[at]);
+        int16_t inputs[NEIGHBOURS];
+        for (int k = 0; k < NEIGHBOURS; ++k)
+            inputs[k] = Range::compressed((range.clipped(values[k]) - centre) * range.inverse);
+        for (int k = 0; k < NEIGHBOURS; ++k) slot[k * BLOCK] = inputs[k];
+        slot[NEIGHBOURS * BLOCK] = range.located(centre);
+        slot[(NEIGHBOURS + 1) * BLOCK] = Range::compressed((centre - range.low) * range.inverse);
     }
 }
 
@@ -192,19 +177,17 @@ FHASH_CLONES int64_t write_inputs_cloned(const Drawn& drawn, const Range& range,
 
 }  // namespace
 
-// Write the inputs of drawn voxels, each seen from `looked_at` places, into their slots.
+// Write the inputs of drawn voxels into their slots.
 //
 // decoded: the tile, of this shape (4 lengths).
 // places: coordinates (4, count) of the voxels; slots: number of each among the voxels of `out`.
-// neighbours: offsets (26, 4) of the neighbours; offsets: (looked_at, 4) of the places.
-// out: (blocks, INPUTS, looked_at, BLOCK).
+// neighbours: offsets (26, 4) of the neighbours.
+// out: (blocks, INPUTS, BLOCK).
 FHASH_EXPORT int64_t fhash_head_inputs(const float* decoded, const int64_t* shape,
                                        const int64_t* places, const int64_t* slots, int64_t count,
-                                       const int64_t* neighbours, const int64_t* offsets,
-                                       int64_t looked_at, double low, double high, double inverse,
-                                       double unit, int16_t* out) {
-    if (!reaches(neighbours, NEIGHBOURS) || !reaches(offsets, looked_at)) return BAD_ARGUMENT;
+                                       const int64_t* neighbours, double low, double high,
+                                       double inverse, double unit, int16_t* out) {
+    if (!reaches(neighbours, NEIGHBOURS)) return BAD_ARGUMENT;
     const Range range = {(float)low, (float)high, (float)inverse, (float)unit};
-    return write_inputs_cloned(
-        {decoded, shape, places, slots, count, neighbours, offsets, looked_at}, range, out);
+    return write_inputs_cloned({decoded, shape, places, slots, count, neighbours}, range, out);
 }

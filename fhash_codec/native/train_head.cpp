@@ -65,28 +65,25 @@ struct Layer {
 
 // Batches of voxels; their layout is that of `Batches` in head_samples.py.
 struct Voxels {
-    const int16_t* inputs;                      // (batches, blocks, INPUTS, looked_at, BLOCK)
+    const int16_t* inputs;                      // (batches, blocks, INPUTS, BLOCK)
     const int32_t *targets, *lowest, *highest;  // (batches, blocks, BLOCK)
-    int64_t blocks, looked_at;
+    int64_t blocks;
 
-    const int16_t* input(int64_t block, int64_t k, int64_t place) const {
-        return inputs + ((block * INPUTS + k) * looked_at + place) * BLOCK;
+    const int16_t* input(int64_t block, int64_t k) const {
+        return inputs + (block * INPUTS + k) * BLOCK;
     }
 };
 
 class Network {
 public:
-    Network(double* parameters_, int64_t looked_at_, int64_t first, int64_t second)
+    Network(double* parameters_, int64_t first, int64_t second)
         : parameters(parameters_),
-          looked_at(looked_at_),
           input(INPUTS * BLOCK),
-          activations{Buffer(first * looked_at_ * BLOCK),
-                      Buffer(second * BLOCK)},
-          slopes{Buffer(first * looked_at_ * BLOCK),
-                 Buffer(second * BLOCK)},
+          activations{Buffer(first * BLOCK), Buffer(second * BLOCK)},
+          slopes{Buffer(first * BLOCK), Buffer(second * BLOCK)},
           error(BLOCK),
           error_slopes(BLOCK) {
-        const int64_t inputs[LAYERS] = {INPUTS, first * looked_at, second};
+        const int64_t inputs[LAYERS] = {INPUTS, first, second};
         const int64_t outputs[LAYERS] = {first, second, 1};
         const double* at = parameters;
         for (int l = 0; l < LAYERS; ++l) {
@@ -112,14 +109,11 @@ public:
     // The errors of a block, into `error`.
     void forward(const Voxels& voxels, int64_t block) {
         Layer &one = layers[0], &two = layers[1], &three = layers[2];
-        const int64_t stride = looked_at * BLOCK;
-        for (int64_t place = 0; place < looked_at; ++place) {
-            load(voxels, block, place);
-            products(input.data(), INPUTS, one.integers.data(), one.outputs,
-                     &activations[0][place * BLOCK], stride);
-        }
+        load(voxels, block);
+        products(input.data(), INPUTS, one.integers.data(), one.outputs, activations[0].data(),
+                 BLOCK);
         activate(activations[0].data(), two.inputs, one.scale * (ACTIVATION_UNIT / INPUT_UNIT),
-                 one.used_biases.data(), looked_at);
+                 one.used_biases.data(), 1);
         products(activations[0].data(), two.inputs, two.integers.data(), two.outputs,
                  activations[1].data(), BLOCK);
         activate(activations[1].data(), two.outputs, two.scale, two.used_biases.data(), 1);
@@ -146,12 +140,10 @@ public:
         products(slopes[1].data(), two.outputs, two.transposed.data(), two.inputs,
                  slopes[0].data(), BLOCK);
         descend(slopes[0].data(), two.inputs, two.scale, activations[0].data());
-        gather_biases(slopes[0].data(), looked_at, one.outputs, one.bias_sums.data());
-        for (int64_t place = 0; place < looked_at; ++place) {
-            load(voxels, block, place);
-            gather(&slopes[0][place * BLOCK], looked_at * BLOCK, one.outputs, input.data(), INPUTS,
-                   one.weight_sums.data());
-        }
+        gather_biases(slopes[0].data(), 1, one.outputs, one.bias_sums.data());
+        // `input` is still that of `forward`.
+        gather(slopes[0].data(), BLOCK, one.outputs, input.data(), INPUTS,
+               one.weight_sums.data());
     }
 
     // Begin to add up slopes.
@@ -214,13 +206,11 @@ private:
         return sum;
     }
 
-    void load(const Voxels& voxels, int64_t block, int64_t place) {
-        for (int64_t k = 0; k < INPUTS; ++k)
-            widened(voxels.input(block, k, place), &input[k * BLOCK]);
+    void load(const Voxels& voxels, int64_t block) {
+        for (int64_t k = 0; k < INPUTS; ++k) widened(voxels.input(block, k), &input[k * BLOCK]);
     }
 
     double* const parameters;
-    const int64_t looked_at;
     Layer layers[LAYERS];
     Buffer input, activations[2], slopes[2], error, error_slopes, gradient;
 };
@@ -232,7 +222,7 @@ public:
     Team(double* parameters, const int64_t* sizes, const Voxels& of, int64_t threads, bool round)
         : voxels(of), rounds(round), next(voxels.blocks) {
         for (int64_t i = 0; i < std::max<int64_t>(threads, 1); ++i) {
-            auto network = std::make_unique<Network>(parameters, sizes[3], sizes[4], sizes[5]);
+            auto network = std::make_unique<Network>(parameters, sizes[3], sizes[4]);
             members.push_back({std::move(network)});
         }
         helpers.reserve(members.size());
@@ -303,16 +293,14 @@ private:
 
 bool fits(const int64_t* sizes) {
     return sizes[0] > 0 && sizes[1] > 0 && sizes[1] <= MAX_BLOCKS && sizes[2] == BLOCK &&
-           sizes[3] > 0 && sizes[3] <= MAX_LOOKED_AT && sizes[4] > 0 && sizes[4] <= MAX_WIDTH &&
-           sizes[5] > 0 && sizes[5] <= MAX_WIDTH;
+           sizes[3] > 0 && sizes[3] <= MAX_WIDTH && sizes[4] > 0 && sizes[4] <= MAX_WIDTH;
 }
 
 }  // namespace
 
 // Do the updates first .. first + count - 1 of a training. Update u learns from batch u % batches.
 //
-// sizes: batches, blocks of a batch, voxels of a block, voxels looked at for each, widths of the
-// two hidden layers.
+// sizes: batches, blocks of a batch, voxels of a block, widths of the two hidden layers.
 // parameters, means, squares: weights and biases of each layer in turn, and Adam's means of them.
 // rates, roots: of each update, the learning rate and the factor of the root of the mean square,
 // both corrected for Adam's start.
@@ -326,7 +314,7 @@ FHASH_EXPORT int64_t fhash_head_learn(const int16_t* inputs, const int32_t* targ
                                       int64_t threads) {
     if (!fits(sizes)) return BAD_ARGUMENT;
     return guarded([&]() -> int64_t {
-        const Voxels voxels = {inputs, targets, lowest, highest, sizes[1], sizes[3]};
+        const Voxels voxels = {inputs, targets, lowest, highest, sizes[1]};
         Team team(parameters, sizes, voxels, std::min(threads, sizes[1]), as_in_file != 0);
         for (int64_t update = 0; update < count; ++update) {
             Network& network = team.learn((first + update) % sizes[0]);
@@ -343,8 +331,8 @@ FHASH_EXPORT int64_t fhash_head_errors(const int16_t* inputs, const int32_t* tar
                                        int64_t as_in_file, int64_t* sums) {
     if (!fits(sizes)) return BAD_ARGUMENT;
     return guarded([&]() -> int64_t {
-        const Voxels voxels = {inputs, targets, lowest, highest, sizes[1], sizes[3]};
-        Network network(parameters, sizes[3], sizes[4], sizes[5]);
+        const Voxels voxels = {inputs, targets, lowest, highest, sizes[1]};
+        Network network(parameters, sizes[3], sizes[4]);
         network.prepare(as_in_file != 0);
         for (int64_t batch = 0; batch < sizes[0]; ++batch) {
             sums[batch] = 0;

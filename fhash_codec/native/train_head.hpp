@@ -28,8 +28,7 @@ using std::int32_t;
 using std::int64_t;
 
 constexpr int64_t BLOCK = 64;          // voxels that are evaluated together
-constexpr int64_t INPUTS = 28;         // inputs of the first layer per voxel looked at
-constexpr int64_t MAX_LOOKED_AT = 9;   // voxels looked at: the cross
+constexpr int64_t INPUTS = 28;         // inputs of the first layer
 constexpr int64_t MAX_BLOCKS = 64;     // of a batch
 constexpr int64_t MAX_WIDTH = 64;      // outputs of a hidden layer
 constexpr int LAYERS = 3;

@@ -109,10 +109,10 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
         ({"psnr": -1.0}, "psnr is -1"),
         ({"features": ()}, "feature is empty"),
         ({"dilation": -1}, "dilation is -1"),
-        ({"without": ("heads",)}, "without names 'heads'; did you mean 'head'"),
+        ({"without": ("tile",)}, "without names 'tile'; did you mean 'tiles'"),
         (
-            {"profile": "paper", "without": "head"},
-            "without names 'head', a stage of --profile compact",
+            {"profile": "paper", "without": "tiles"},
+            "without names 'tiles', a stage of --profile compact",
         ),
     ],
 )
@@ -302,27 +302,20 @@ def test_parts_are_counted_when_the_next_one_begins(parts: Parts, calls: list[Ca
 
 def test_other_threads_count_and_do_not_call(parts: Parts, calls: list[Call]) -> None:
     parts.begin("head")
-    go_on, shares = threading.Event(), [0.0]
 
-    def work() -> str:
-        assert go_on.wait(30)
+    def work() -> None:
         parts.tick()
         parts.report("training", 0.9)
-        return "done"
-
-    def share() -> float:
-        go_on.set()
-        shares.append(min(1.0, shares[-1] + 0.5))
-        return shares[-1]
 
     with ThreadPoolExecutor(1) as workers:
-        works = [workers.submit(work)]
-        parts.wait(works, "training", share, poll_seconds=0.01)
-        assert works[0].result() == "done"
-    assert calls[:2] == [("planning", 0, 3, "head"), ("training", 50, 100, "")]
-    assert ("training", 90, 100, "") not in calls
+        workers.submit(work).result()
+    parts.report("training", 0.5)
     parts.tick()
-    assert calls[-1] == ("planning", 0, 3, "head, 2 tiles tried")
+    assert calls == [
+        ("planning", 0, 3, "head"),
+        ("training", 50, 100, ""),
+        ("planning", 0, 3, "head, 2 tiles tried"),
+    ]
 
 
 class _Hands:
@@ -364,12 +357,12 @@ def test_a_stage_inside_another_takes_its_seconds_from_that_one(hands: _Hands) -
 
 def test_what_is_left_out_was_never_entered_and_says_why() -> None:
     with recording() as clock:
-        skip("head", "--without head")
+        skip("head", "--train none")
         skip("tiles", "at first")
         with stage("tiles", "after all"):
             skip("tiles", "once more")
     head, tiles, _ = clock.to_list()
-    assert head == {"stage": "head", "seconds": 0.0, "times": 0, "why": "--without head"}
+    assert head == {"stage": "head", "seconds": 0.0, "times": 0, "why": "--train none"}
     assert (tiles["times"], tiles["why"]) == (1, "after all")
 
 

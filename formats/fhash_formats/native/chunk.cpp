@@ -414,7 +414,7 @@ bool constant(const Task& task, double center, const Wide& origin, Coded& coded,
     const Draft draft = {{}, 1.0, center, center, center, 0, true, false, false, origin,
                          whole, whole};
     const auto settings = draft.settings(task.context, task.shape, error);
-    const fhash_coding coding = {0, -1, 0, 0, 1, 0, 1, 1, 1, 0};
+    const fhash_coding coding = {0, -1, 0, 0, 0, 1, 0, 1, 1, 1, 0};
     const std::vector<uint8_t> nothing((size_t)task.size(), 0);
     return settings && encode_tile(task.context, settings, task.shape, task.type, task.values,
                                    nothing.data(), task.marks, coding, coded, error);

@@ -291,6 +291,31 @@ bool free_coefficients(const Task& task, const Search<T>& search, std::vector<T>
     return true;
 }
 
+// Leaves to the head what it adds to the values as they would decode: the target becomes the values
+// less its correction, and takes fewer bits.
+bool leave_to_head(const Task& task, const Search<float>& search, std::vector<float>& target,
+                   std::vector<float>& coefficients, fhash_error& error) {
+    const Settings& settings = task.settings;
+    Buffer unused;
+    std::vector<int32_t> integers;
+    // The fast coder chooses integers as it codes them, faster than the trellis of the other one.
+    const bool chosen =
+        task.coding.fast
+            ? code_coefficients(search, coefficients, task.coding, nullptr, unused, integers, error)
+            : choose_integers(search, coefficients, task.coding, 1, nullptr, integers, error);
+    if (!chosen) return false;
+    std::vector<float> table(target.size()), corrected(target.size());
+    if (!linear_values(settings, *search.inverse, integers.data(), table.data(), error) ||
+        !apply_head(task.context, *settings.head, table.data(), task.shape, corrected.data(),
+                    error))
+        return false;
+    const float part = (float)task.coding.joint;
+    for (size_t i = 0; i < target.size(); i++)
+        if (task.counted.empty() || task.counted[i]) target[i] -= part * (corrected[i] - table[i]);
+    return kernel_done(search.forward->transform(target.data(), coefficients.data()),
+                       "a transform", error);
+}
+
 // The residual, in quanta; false without an error where an integer would be too large. Empty where
 // it is 0 everywhere.
 template <class T>
@@ -344,6 +369,11 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
         !make_target(task, *search, target, error) ||
         !free_coefficients(task, *search, target, coefficients, aim.squares, error))
         return false;
+    if constexpr (std::is_same<T, float>::value) {
+        if (settings.head && task.coding.joint > 0 &&
+            !leave_to_head(task, *search, target, coefficients, error))
+            return false;
+    }
     Buffer body, rest, mask;
     std::vector<int32_t> integers, residual;
     std::vector<T>& linear = target;

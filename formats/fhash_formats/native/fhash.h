@@ -131,6 +131,7 @@ typedef struct fhash_coding {
     double error;         /* bound on |decoded - value|; below 0 for none. A tile that cannot keep it is exact */
     double aim;           /* squared error that the choice of integers aims at, as a multiple of what the coefficients
                            * predict (choose.cpp); 0 for that of the weight */
+    double joint;         /* part of a head's correction that values are coded less by; 0 for none */
     int32_t rounds;       /* how often values that are free to change are replaced by their decoded ones */
     int32_t passes;       /* 1, or 2: what was chosen is coded or searched once more */
     int32_t filled;       /* 1: values that do not count are a good filling already */

@@ -71,6 +71,7 @@ class _Coding(ctypes.Structure):
         ("weight", ctypes.c_double),
         ("error", ctypes.c_double),
         ("aim", ctypes.c_double),
+        ("joint", ctypes.c_double),
         *((name, ctypes.c_int32) for name in _OPTIONS),
     )
 
@@ -160,6 +161,8 @@ class Coding:
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
         aim: squared error that the choice of integers aims at, as a multiple of what coefficients
             predict (native/choose.cpp): the weight changes a little for it. 0 for none.
+        joint: part of the correction of a head that values are coded less by, since it adds them
+            when they decode; 0 for none.
         rounds: how often the values that are free to change are replaced by their decoded values.
         passes: 2 codes the integers that the optimisation chose once more, or searches the path
             through the trellis once more; 1 does not.
@@ -174,6 +177,7 @@ class Coding:
     weight: float = 0.0
     error: float | None = None
     aim: float = 0.0
+    joint: float = 0.0
     rounds: int = 0
     passes: int = 1
     filled: bool = False
@@ -330,7 +334,7 @@ def _coded(
     given = None if mask is None else np.ascontiguousarray(mask, np.bool_)
     options = (getattr(coding, name) for name in _OPTIONS)
     bound = -1 if coding.error is None else coding.error
-    asked = _Coding(coding.weight, bound, coding.aim, *options)
+    asked = _Coding(coding.weight, bound, coding.aim, coding.joint, *options)
     decoded = np.empty_like(values)
     data, size, nonzero = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_size_t(), ctypes.c_int64()
     t, z, y, x = values.shape

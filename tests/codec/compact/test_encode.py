@@ -32,7 +32,7 @@ from fhash_codec.compact.encode import (
     code_to_size,
 )
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.head_training import Budget, Pair, Shape, train_head
+from fhash_codec.compact.head_training import Budget, Pair, train_head
 from fhash_codec.compact.plan import CodingPlan, first_settings
 from fhash_codec.compact.planner import block_of, column_of, sheet_of
 from fhash_codec.compact.tiles import Coding, Outcome, recoded
@@ -372,32 +372,33 @@ def test_a_head_holds_where_it_gains_in_all_tiles() -> None:
         selection = select_features(series, config, silent)
         table = code_series(series, selection, config, silent)
         blocks, settings = table.plan.blocks, table.plan.settings
-        assert _head_holds(table, aim, workers)  # it has none
+
+        def code_all(plan: CodingPlan) -> CodedTable:
+            return _code_all(replace(plan, sample=None), workers, silent)
+
+        def with_mlp(head: NeighbourHead) -> CodedTable:
+            plan = replace(table.plan, settings=replace(settings, head=head), plain=table.plan)
+            return code_all(plan)
+
+        assert _head_holds(table, aim, code_all)  # it has none
         pairs = []
         for index, stream in zip(blocks.indices(), table.streams, strict=True):
             tile = blocks.read(index)
             pairs.append(Pair(recoded(tile, stream, settings).decoded, tile.values, None))
-        head = trained(pairs, settings)
-        assert _head_holds(_recoded(table, replace(settings, head=head), workers), aim, workers)
+        assert _head_holds(with_mlp(trained(pairs, settings)), aim, code_all)
         noise = np.random.default_rng(0).normal(size=(2, 24, 32, 32)).astype(np.float32)
         head = trained([Pair(noise, -noise, None)], settings)
-        table = _recoded(table, replace(settings, head=head), workers)
-        assert not _head_holds(table, aim, workers)
+        assert not _head_holds(with_mlp(head), aim, code_all)
 
 
 def trained(pairs: list[Pair], settings: TileSettings) -> NeighbourHead:
     """A small head for some tiles."""
     low, high = settings.low, settings.high
     found = train_head(
-        pairs, low, high, Shape((4, 4), cross=False), Budget(updates=300, samples=60_000)
+        pairs, low, high, (4, 4), Budget(updates=300, samples=60_000)
     )
     assert found is not None
     return found.head
-
-
-def _recoded(table: CodedTable, settings: TileSettings, workers: ThreadPoolExecutor) -> CodedTable:
-    """All tiles of a table with other settings."""
-    return _code_all(replace(table.plan, settings=settings, sample=None), workers, silent)
 
 
 Law = Callable[[float], float]

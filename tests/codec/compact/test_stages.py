@@ -39,7 +39,6 @@ from fhash_codec.compact.goal import (
     search,
     with_step,
 )
-from fhash_codec.compact.head import EFFORTS, Budget
 from fhash_codec.compact.labels import holds_beside, rank_share
 from fhash_codec.compact.plan import CodingPlan, first_settings, plan
 from fhash_codec.compact.predictor import IntegerTile, fit_weights
@@ -303,8 +302,6 @@ def test_scores_of_a_mask_are_learned_from_tiles() -> None:
 def test_more_effort_is_no_larger_and_keeps_the_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: Field
 ) -> None:
-    budget = Budget(updates=200, samples=40_000)
-    monkeypatch.setitem(EFFORTS, 5, replace(EFFORTS[5], perceptron=budget))
     source = field((4, 12, 16, 16))
     reports = [
         fhash_codec.encode(source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0))
@@ -332,7 +329,7 @@ def test_a_stage_that_is_switched_off_is_never_entered(field: Field, tmp_path: P
         config = EncodeConfig(effort=5, max_error=0.5, without=without)
         return _stages(fhash_codec.encode(values, path, config, mask=mask, force=True))
 
-    every = ("tiles", "transform", "filling", "head", "predictor", "ssim")
+    every = ("tiles", "transform", "filling", "predictor", "ssim")
     without = encode(every)
     for name in every:
         assert without[name]["times"] == 0
