@@ -194,7 +194,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Feature": ("feature", "dilation"),
     "Steps and region": ("time", "roi", "box", "lod"),
     "Values": ("outside", "fill"),
-    "Profile compact": ("profile", "effort", "tile", "access", "without"),
+    "Profile compact": ("profile", "effort", "train", "tile", "access", "without"),
     "Profile paper": (
         "key-frames", "samples", "fold", "embedding-size", "hidden-layers", "width", "epochs",
         "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables", "engine",

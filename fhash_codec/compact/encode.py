@@ -46,7 +46,6 @@ from fhash_codec.compact.tiles import (
     code,
     code_tiles,
     fits_memory,
-    measured,
     return_memory,
     total,
 )

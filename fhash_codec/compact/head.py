@@ -27,8 +27,7 @@ from fhash_codec.compact.head_training import (
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Coding, Outcome, Tile, measured, total
 from fhash_codec.compact.transform import scale_of
-from fhash_codec.progress import skip, stage
-from fhash_formats.support.values import Single
+from fhash_codec.progress import stage
 from fhash_formats.transform.head import NeighbourHead
 from fhash_formats.transform.tile import CodedTile, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
@@ -39,9 +38,9 @@ GAIN_BY_WIDTHS = {(12, 8): 1.0, (24, 16): 1.2, (48, 16): 1.35}
 MOST_WIDTHS = {"fast": 1, "balanced": 2, "small": 3}
 """How many of these are considered, by the wish for access: decoding takes 5, 13 and 25 ns more for
 each vertex (AVX-512; 8, 20 and 45 with AVX2), where SPERR takes some 40."""
-LEAST_GAIN = 0.25
-"""Gain in dB of least squares below which nothing is trained: below it, at 0.15, a training saved 1
-to 3 % in twice the seconds; above it, from 0.6 on, 10 to 40 %."""
+LEAST_GAIN = 0.3
+"""Gain in dB of least squares below which nothing is trained: at 0.15 a training saved up to 4 % in
+two to three times the seconds, from 0.6 on 4 to 40 %."""
 GAIN_OF_MLP = 1.6
 """Gain of the narrowest as a multiple of that of least squares: 1.6 to 1.9 on three series."""
 MOST_EXCESS = 6.0
@@ -56,10 +55,12 @@ JOINT = 1.2
 """Part of the MLP's correction that values are coded less by: it counts on what it has yet to
 learn. 1 saves up to 1 % less, 1.5 diverges in the third pass."""
 PASSES = 2
-"""Trainings at most, each on what the one before left."""
+"""Trainings, each on what the one before left; a third saves another 1 % of the bytes."""
+LONG = 2
+"""Trainings of more than so many times UPDATES have a third pass."""
 AGAIN = 0.3
 """Updates of each further training, as a share of those of the first."""
-UPDATES = 1000
+UPDATES = 600
 """Updates of the first training at effort 5; twice as many at each further effort."""
 VERTICES_OF_UPDATE = 1500
 """Vertices of a series for each of these updates, at least: a short series trains shortly."""
@@ -73,8 +74,10 @@ RATE = 3e-2
 """Highest learning rate of the first training, up to UPDATES; a longer one learns more slowly."""
 RATE_AGAIN = 1e-2
 """Highest learning rate of further trainings and of long ones."""
-MOST_AHEAD = 1.1
-"""Factor by which a step is larger at most for what is coded with the MLP of the last pass."""
+MOST_AHEAD = 1.2
+"""Factor of the steps of two passes that is believed at most."""
+LEFT = 0.97
+"""Share of the bytes that an MLP leaves at most, by default: every reader pays for it."""
 AIM_OF_MLP = 0.06
 """dB above the promise that a step is for: half of the steps would miss it else."""
 FAR = 0.4
@@ -106,6 +109,15 @@ def expected_share(foretold: float) -> float:
     foretold: gain in dB of least squares.
     """
     return float(2 ** (-GAIN_OF_MLP * GAIN_BY_WIDTHS[24, 16] * foretold / OCTAVE))
+
+
+def most_left(task: PlanTask) -> float:
+    """Return the share of the bytes that an MLP may leave so that it is kept.
+
+    Who asks for a training, or for the fewest bytes at any cost, reads more slowly for any of them.
+    """
+    config = task.config
+    return 1.0 if config.access == "small" or config.train != "auto" else LEFT
 
 
 class ChosenHead(NamedTuple):
@@ -164,7 +176,7 @@ def choose_head(
         if task.goal.psnr is None:
             return _at_bound(task, attempt, learned, best, plain)
         left = size * best.share + own_bytes(best.trained)
-        if left >= size:
+        if left >= size * most_left(task):
             return plain
         return ChosenHead(
             replace(settings, head=best.trained.head, step=best.step),
@@ -183,10 +195,10 @@ def training_length(task: PlanTask, widths: Widths) -> tuple[int, int]:
     if seconds is None:
         short = prod(task.blocks.shape) // VERTICES_OF_UPDATE
         updates = max(min(short, UPDATES), LEAST_UPDATES) << (task.config.effort - 5)
-        return updates, PASSES
-    of_update = 1e-9 * TRAINING_NS * weights_of(widths) * BATCH_VOXELS
-    updates = seconds / of_update / (1 + AGAIN * (PASSES - 1))
-    return max(1, round(updates)), PASSES
+    else:
+        of_update = 1e-9 * TRAINING_NS * weights_of(widths) * BATCH_VOXELS
+        updates = max(1, round(seconds / of_update / (1 + AGAIN * (PASSES - 1))))
+    return updates, PASSES if updates <= LONG * UPDATES else PASSES + 1
 
 
 def _trained(
@@ -206,7 +218,7 @@ def _trained(
     if task.goal.psnr is not None and not parts.complete:  # their PSNR is not that of all tiles
         promise = parts.run(at, attempt.coding).psnr(data_range) + AIM_OF_MLP
     updates, count = training_length(task, widths)
-    lengths = [updates if number == 0 else max(1, round(AGAIN * updates)) for number in range(count)]
+    lengths = [updates, *[max(1, round(AGAIN * updates))] * (count - 1)]
     for number, length in enumerate(lengths):
         coded = alone if trained is None else _left_to(trained.head, parts, alone)
         trained = train_head(
@@ -230,8 +242,8 @@ def _trained(
         share = coded.size / max(alone.size, 1) * 2 ** (-gained / OCTAVE)
         excess = min(psnr - promise, MOST_EXCESS)
         step = coarser.step * math.exp(excess / slope)
-        # What is coded with the MLP of a pass is learned by the next one: it gains as much again.
-        better = step * min(max(step / before, 1.0), MOST_AHEAD) if before else step
+        # Coded with what this pass has learned, the table gains half as much again.
+        better = step * math.sqrt(min(max(step / before, 1.0), MOST_AHEAD)) if before else step
         before = step
         done.append(_Pass(trained, psnr, better, share, JOINT if number else 0.0))
         if abs(excess) > FAR and number + 1 < count:
@@ -276,7 +288,7 @@ def _left_to(head: NeighbourHead, parts: Sample, alone: _Coded) -> _Coded:
             values = pair.original.astype(np.float32) - less
         return encode_tile(values, alone.settings, alone.coding, in_coreset=pair.counted)
 
-    tiles = list(map(coded, alone.pairs))
+    tiles = parts.each(coded, alone.pairs)
     pairs = [
         pair._replace(decoded=tile.decoded) for pair, tile in zip(alone.pairs, tiles, strict=True)
     ]
@@ -293,7 +305,8 @@ def _corrected(parts: Sample, coded: _Coded, trained: TrainedHead) -> Outcome:
         decoded = CodedTile(data=b"", decoded=values, nonzero=0)
         return measured(tile, decoded, coded.settings, coded.coding)
 
-    return total(list(map(corrected, zip(coded.pairs, parts.tiles, strict=True))), parts.weights)
+    jobs = list(zip(coded.pairs, parts.tiles, strict=True))
+    return total(parts.each(corrected, jobs), parts.weights)
 
 
 def _report(task: PlanTask, before: int, length: int, total: int) -> Callable[[float], None]:
@@ -322,7 +335,7 @@ def _at_bound(
     trained = replace(attempt.settings, head=best.trained.head, step=best.step)
     settings, outcome = find_step(few, trained, joint, task.goal, tries=3)
     size = attempt.outcome.size * outcome.size / before.size + own_bytes(best.trained)
-    if size >= attempt.outcome.size:
+    if size >= attempt.outcome.size * most_left(task):
         return plain
     return ChosenHead(settings, joint, replace(attempt.outcome, size=round(size)), plain.history)
 

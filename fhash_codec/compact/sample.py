@@ -69,6 +69,7 @@ def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
         return Tile(np.where(counted, values, filling.astype(values.dtype)), counted)
 
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 Grams = dict[tuple[int, float], npt.NDArray[np.float64]]
 """Products of lines by axis and centre."""
@@ -229,6 +230,10 @@ class Sample:
     def map(self, work: Callable[[Tile], Result]) -> list[Result]:
         """Return the results of `work` for the tiles of the sample, in order, by all threads."""
         return list(self._ticking(self._pool.map(work, self.tiles)))
+
+    def each(self, work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        """Return the results of `work` for items, one of each tile of the sample."""
+        return list(self._ticking(self._pool.map(work, items)))
 
     def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
         """Yield the results of `work` for all tiles of the series, in C order."""

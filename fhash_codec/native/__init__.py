@@ -54,8 +54,8 @@ PROTOTYPES: Prototypes = {
         *(*(REAL,) * 4, ARRAY),
     ),
     # train_head.cpp
-    "fhash_head_learn": (*(ARRAY,) * 10, *(INTEGER,) * 4),
-    "fhash_head_errors": (*(ARRAY,) * 6, INTEGER, ARRAY),
+    "fhash_head_learn": (*(ARRAY,) * 11, *(INTEGER,) * 4),
+    "fhash_head_errors": (*(ARRAY,) * 7, INTEGER, ARRAY),
 }
 """Functions of this package's library that Python calls."""
 

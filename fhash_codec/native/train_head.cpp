@@ -67,6 +67,7 @@ struct Layer {
 struct Voxels {
     const int16_t* inputs;                      // (batches, blocks, INPUTS, BLOCK)
     const int32_t *targets, *lowest, *highest;  // (batches, blocks, BLOCK)
+    const float* weights;                       // likewise, up to 1
     int64_t blocks;
 
     const int16_t* input(int64_t block, int64_t k) const {
@@ -82,6 +83,7 @@ public:
           activations{Buffer(first * BLOCK), Buffer(second * BLOCK)},
           slopes{Buffer(first * BLOCK), Buffer(second * BLOCK)},
           error(BLOCK),
+          weighted(BLOCK),
           error_slopes(BLOCK) {
         const int64_t inputs[LAYERS] = {INPUTS, first, second};
         const int64_t outputs[LAYERS] = {first, second, 1};
@@ -122,7 +124,7 @@ public:
         const int64_t at = block * BLOCK;
         errors_of(error.data(), three.scale * (ERROR_UNIT / ACTIVATION_UNIT), three.used_biases[0],
                   voxels.targets + at, voxels.lowest + at, voxels.highest + at,
-                  error_slopes.data());
+                  voxels.weights + at, weighted.data(), error_slopes.data());
     }
 
     // Add the slopes of a block, after `forward`, to the sums.
@@ -189,13 +191,10 @@ public:
         }
     }
 
-    // The sum of the squared errors of a block, after `forward`.
+    // The sum of the squared errors of a block by their weights, after `forward`.
     int64_t squared_errors() const {
         int64_t sum = 0;
-        for (int64_t i = 0; i < BLOCK; ++i) {
-            const int64_t whole = (int64_t)error[i];
-            sum += whole * whole;
-        }
+        for (int64_t i = 0; i < BLOCK; ++i) sum += (int64_t)error[i] * (int64_t)weighted[i];
         return sum;
     }
 
@@ -212,7 +211,7 @@ private:
 
     double* const parameters;
     Layer layers[LAYERS];
-    Buffer input, activations[2], slopes[2], error, error_slopes, gradient;
+    Buffer input, activations[2], slopes[2], error, weighted, error_slopes, gradient;
 };
 
 // Threads that add up the slopes of a batch together: sums are exact in any order, so their number
@@ -300,6 +299,7 @@ bool fits(const int64_t* sizes) {
 
 // Do the updates first .. first + count - 1 of a training. Update u learns from batch u % batches.
 //
+// weights: of the squared errors, up to 1 (batches, blocks, voxels).
 // sizes: batches, blocks of a batch, voxels of a block, widths of the two hidden layers.
 // parameters, means, squares: weights and biases of each layer in turn, and Adam's means of them.
 // rates, roots: of each update, the learning rate and the factor of the root of the mean square,
@@ -308,13 +308,14 @@ bool fits(const int64_t* sizes) {
 // threads: that may work on a batch together.
 FHASH_EXPORT int64_t fhash_head_learn(const int16_t* inputs, const int32_t* targets,
                                       const int32_t* lowest, const int32_t* highest,
-                                      const int64_t* sizes, double* parameters, double* means,
+                                      const float* weights, const int64_t* sizes,
+                                      double* parameters, double* means,
                                       double* squares, const double* rates, const double* roots,
                                       int64_t first, int64_t count, int64_t as_in_file,
                                       int64_t threads) {
     if (!fits(sizes)) return BAD_ARGUMENT;
     return guarded([&]() -> int64_t {
-        const Voxels voxels = {inputs, targets, lowest, highest, sizes[1]};
+        const Voxels voxels = {inputs, targets, lowest, highest, weights, sizes[1]};
         Team team(parameters, sizes, voxels, std::min(threads, sizes[1]), as_in_file != 0);
         for (int64_t update = 0; update < count; ++update) {
             Network& network = team.learn((first + update) % sizes[0]);
@@ -324,14 +325,15 @@ FHASH_EXPORT int64_t fhash_head_learn(const int16_t* inputs, const int32_t* targ
     });
 }
 
-// sums: of the squared errors of each batch, in squares of the unit of errors.
+// sums: of the weighted squared errors of each batch, in squares of the unit of errors.
 FHASH_EXPORT int64_t fhash_head_errors(const int16_t* inputs, const int32_t* targets,
                                        const int32_t* lowest, const int32_t* highest,
-                                       const int64_t* sizes, double* parameters,
+                                       const float* weights, const int64_t* sizes,
+                                       double* parameters,
                                        int64_t as_in_file, int64_t* sums) {
     if (!fits(sizes)) return BAD_ARGUMENT;
     return guarded([&]() -> int64_t {
-        const Voxels voxels = {inputs, targets, lowest, highest, sizes[1]};
+        const Voxels voxels = {inputs, targets, lowest, highest, weights, sizes[1]};
         Network network(parameters, sizes[3], sizes[4]);
         network.prepare(as_in_file != 0);
         for (int64_t batch = 0; batch < sizes[0]; ++batch) {

@@ -194,12 +194,14 @@ FHASH_CLONES_512 void activate(double* FHASH_RESTRICT values, int64_t outputs, d
     }
 }
 
-// Outputs of the last layer, in place, to errors. An output beyond the clip range is clipped, and
-// its slope is 0.
+// Outputs of the last layer, in place, to errors, and these times their weights. An output beyond the
+// clip range is clipped, and its slope is 0.
 FHASH_CLONES_512 void errors_of(double* FHASH_RESTRICT values, double scale, double bias,
                             const int32_t* FHASH_RESTRICT targets,
                             const int32_t* FHASH_RESTRICT lowest,
-                            const int32_t* FHASH_RESTRICT highest, double* FHASH_RESTRICT slopes) {
+                            const int32_t* FHASH_RESTRICT highest,
+                            const float* FHASH_RESTRICT weights, double* FHASH_RESTRICT weighted,
+                            double* FHASH_RESTRICT slopes) {
     const double shift = bias * ERROR_UNIT;
     for (int64_t i = 0; i < BLOCK; ++i) {
         const double low = lowest[i], high = highest[i];
@@ -208,7 +210,8 @@ FHASH_CLONES_512 void errors_of(double* FHASH_RESTRICT values, double scale, dou
         const double clipped = raised < high ? raised : high;
         const double error = limited(clipped - (double)targets[i], MAX_ERROR);
         values[i] = error;
-        slopes[i] = clipped == out ? error : 0.0;
+        weighted[i] = rounded(error * (double)weights[i]);
+        slopes[i] = clipped == out ? weighted[i] : 0.0;
     }
 }
 

@@ -394,9 +394,7 @@ def test_a_head_holds_where_it_gains_in_all_tiles() -> None:
 def trained(pairs: list[Pair], settings: TileSettings) -> NeighbourHead:
     """A small head for some tiles."""
     low, high = settings.low, settings.high
-    found = train_head(
-        pairs, low, high, (4, 4), Budget(updates=300, samples=60_000)
-    )
+    found = train_head(pairs, low, high, (4, 4), Budget(updates=300, samples=60_000))
     assert found is not None
     return found.head
 
