@@ -183,6 +183,8 @@ EDGES = (256, 192, 128, 96, 64, 48, 32, 24, 16)
 """Edges in space in vertices that tiles are tried at, approximately."""
 SHORTEST = 8
 """Vertices of a tile along the longest axis in space, at least, where it alone is cut."""
+LONGEST_BASIS = 128
+"""Vertices along an axis with a basis of the data's own, at most (native/planner.cpp)."""
 TILE_BYTES = 100
 """Bytes that each further tile costs: its place in the file, and the beginning of its coder."""
 
@@ -242,7 +244,7 @@ def tiles_to_try(shape: Shape, max_vertices: int, *, slabs: bool = False) -> lis
 
     Axes in space are cut into parts of about one edge, time into parts of about one length. Of the
     tiles whose regions take no more than FAST_ENOUGH vertices, only the one of the slowest is
-    among them.
+    among them, and where its steps are too many for a basis the largest one that has one.
 
     slabs: whether there are also tiles with cuts across the longest axes in space alone: where all
         of space is too much, these have the fewest cuts.
@@ -260,8 +262,9 @@ def tiles_to_try(shape: Shape, max_vertices: int, *, slabs: bool = False) -> lis
         tiles += [tile for t in lengths for tile in _largest_slabs(shape, t, max_vertices)]
     tiles = [tile for tile in tiles if prod(tile) <= max_vertices]
     tiles = sorted(set(tiles), key=lambda tile: (region_vertices(shape, tile), tile))
-    fast = sum(region_vertices(shape, tile) <= FAST_ENOUGH for tile in tiles)
-    return tiles[max(fast - 1, 0) :]
+    fast = max(sum(region_vertices(shape, tile) <= FAST_ENOUGH for tile in tiles) - 1, 0)
+    of_basis = [tile for tile in tiles[:fast] if tile[0] <= LONGEST_BASIS < tiles[fast][0]]
+    return sorted(of_basis, key=prod)[-1:] + tiles[fast:]
 
 
 def _slabs(shape: Shape, space: tuple[int, int, int]) -> list[tuple[int, int, int]]:
