@@ -433,8 +433,8 @@ class Attempt:
     """Options of the encoder, without the bound."""
     plain: Attempt | None = None
     """The same without an MLP, where the settings have one."""
-    in_doubt: bool = False
-    """Whether it is not sure that the MLP saves bytes."""
+    saved: float | None = None
+    """Share of the bytes of the tiles that the MLP saves, about; None without one."""
     coded: bool = False
     """Whether the outcome is that of all tiles, or of many where a series is large."""
     history: HeadHistory = field(default_factory=list)

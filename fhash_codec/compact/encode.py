@@ -218,6 +218,9 @@ QUICK_EXCESS = 0.5
 the seconds."""
 MARGIN = 0.005
 """dB added to the PSNR in the second pass; four times as much in each further one."""
+SURE = 0.03
+"""Share of the bytes from which on nobody doubts that an MLP saves some: below it, the tiles are
+coded without one as well."""
 EXCESS_OF_MLP = 0.2
 """Excess in dB that is worth another pass with an MLP, which takes twice the time and saves 1 % of
 the bytes."""
@@ -276,7 +279,8 @@ def code_series(
             window = ByteWindow.of(goal, overhead)
             table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
         plain = coding_plan.plain
-        if plain is not None and coding_plan.in_doubt and table.plan.settings.head is not None:
+        doubtful = coding_plan.saved is not None and coding_plan.saved < SURE
+        if plain is not None and doubtful and table.plan.settings.head is not None:
             other = coded(plain)
             if other.outcome.size < table.outcome.size + head_bytes(table):
                 table = other
@@ -661,16 +665,17 @@ def table_header(
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": None if table.bulk is None else {"range": list(table.bulk.ends)}},
-        "training": training_header(trained, timings=config.timings),
+        "training": training_header(table.plan, timings=config.timings),
         "history": brief_history(trained, timings=config.timings, most=HEAD_POINTS),
     }
 
 
-def training_header(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
-    """Return what a header says of the training of the best head, which has this history.
+def training_header(coding_plan: CodingPlan, *, timings: bool) -> dict[str, Any]:
+    """Return what a header says of the training of the MLP.
 
     The device is "none" where nothing was trained.
     """
+    history = coding_plan.history
     if not history:
         return {"seconds": 0 if timings else None, "steps": 0, "epochs": 0, "device": "none"}
     last = history[-1]
@@ -683,4 +688,5 @@ def training_header(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
         "steps": int(steps),
         "epochs": max(1, round(steps * BATCH_VOXELS / samples)),
         "device": "cpu",
+        **({} if coding_plan.saved is None else {"saved": round(coding_plan.saved, 3)}),
     }

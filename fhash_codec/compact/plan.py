@@ -92,8 +92,8 @@ class CodingPlan:
     where nothing was tried."""
     plain: CodingPlan | None = None
     """The plan without an MLP, where this one has one."""
-    in_doubt: bool = False
-    """Whether it is not sure that the MLP saves bytes."""
+    saved: float | None = None
+    """Share of the bytes of the tiles that the MLP saves, about; None without one."""
     keeps_decoded: bool = False
     """Whether all tiles are kept as they decode, to be measured without being decoded again."""
 
@@ -237,7 +237,7 @@ def _plan_of(task: PlanTask, attempt: Attempt, *, labels: bool) -> CodingPlan:
         history=attempt.history,
         tiling=attempt.tiling,
         plain=None if attempt.plain is None else _plan_of(task, attempt.plain, labels=labels),
-        in_doubt=attempt.in_doubt,
+        saved=attempt.saved,
         size=attempt.outcome.size if _keeps_promise(task, attempt.outcome) else math.inf,
         keeps_decoded=small and not coded,
     )

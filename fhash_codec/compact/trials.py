@@ -504,7 +504,7 @@ def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Att
         settings=found.settings,
         coding=found.coding,
         plain=replace(attempt, history=found.history),
-        in_doubt=found.outcome.size > SURE * attempt.outcome.size,
+        saved=1 - found.outcome.size / max(attempt.outcome.size, 1),
         outcome=found.outcome,
         history=found.history,
         coded=False,
@@ -529,10 +529,6 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
 
 LEARNED = 6 << 20
 """Vertices of the tiles that are learned from, unless a single one has more."""
-SURE = 0.97
-"""Share of the bytes without an MLP up to which nobody doubts that it saves some."""
-
-
 def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
     """Return the plan with a head, or with a predictor under a strict bound, if that is smaller."""
     settings = _predictor_of(task, attempt)

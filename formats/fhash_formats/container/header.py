@@ -530,6 +530,7 @@ def _check_training(training: Record) -> None:
     if training.has("restarts"):
         training.integer("restarts", 0, MAX_LENGTH)
     training.number_or_null("learning_rate")
+    training.number_or_null("saved")
 
 
 def _check_history(history: Record) -> None:
