@@ -649,7 +649,7 @@ def table_header(
     seconds: duration of the encoding; None if it is not to be told.
     """
     extent = selection.extent
-    trained = table.plan.history
+    kept = table.plan.history if table.plan.settings.head is not None else []
     tiling = tiling_header(table)
     return {
         "encoder": {
@@ -666,7 +666,7 @@ def table_header(
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": None if table.bulk is None else {"range": list(table.bulk.ends)}},
         "training": training_header(table.plan, timings=config.timings),
-        "history": brief_history(trained, timings=config.timings, most=HEAD_POINTS),
+        "history": brief_history(kept, timings=config.timings, most=HEAD_POINTS),
     }
 
 

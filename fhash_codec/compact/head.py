@@ -68,7 +68,7 @@ LEAST_UPDATES = 300
 """Updates of the first training at least: fewer teach nothing."""
 TRIED = 1 << 20
 """Vertices of the tiles that are coded with steps under a bound, unless one has more."""
-SAMPLES = 400_000
+SAMPLES = 200_000
 """Vertices that are learned from: what few teach, often repeated, holds for few."""
 RATE = 3e-2
 """Highest learning rate of the first training, up to UPDATES; a longer one learns more slowly."""

@@ -495,6 +495,7 @@ def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Att
     learned = learned.filled(attempt.settings, attempt.coding.density)
     filled = replace(attempt, coding=with_fill(attempt.coding))
     found = choose_head(task, filled, learned, gain)
+    return_memory()
     if found is None or found.settings.head is None:
         task.gains.note("head (left out)", attempt.outcome)
         return attempt if found is None else replace(attempt, history=found.history)

@@ -304,14 +304,18 @@ bool leave_to_head(const Task& task, const Search<float>& search, std::vector<fl
             ? code_coefficients(search, coefficients, task.coding, nullptr, unused, integers, error)
             : choose_integers(search, coefficients, task.coding, 1, nullptr, integers, error);
     if (!chosen) return false;
-    std::vector<float> table(target.size()), corrected(target.size());
-    if (!linear_values(settings, *search.inverse, integers.data(), table.data(), error) ||
-        !apply_head(task.context, *settings.head, table.data(), task.shape, corrected.data(),
+    std::vector<float>& table = coefficients;  // which are not needed any more
+    if (!linear_values(settings, *search.inverse, integers.data(), table.data(), error))
+        return false;
+    integers = {};
+    std::vector<float> corrected(target.size());
+    if (!apply_head(task.context, *settings.head, table.data(), task.shape, corrected.data(),
                     error))
         return false;
     const float part = (float)task.coding.joint;
     for (size_t i = 0; i < target.size(); i++)
         if (task.counted.empty() || task.counted[i]) target[i] -= part * (corrected[i] - table[i]);
+    corrected = {};
     return kernel_done(search.forward->transform(target.data(), coefficients.data()),
                        "a transform", error);
 }
