@@ -69,11 +69,16 @@ LEAST_UPDATES = 300
 TRIED = 1 << 20
 """Vertices of the tiles that are coded with steps under a bound, unless one has more."""
 SAMPLES = 200_000
-"""Vertices that are learned from: what few teach, often repeated, holds for few."""
+"""Vertices that are learned from at least: what few teach, often repeated, holds for few."""
+SAMPLES_OF_UPDATE = 333
+"""Vertices that are learned from for each update of the first training."""
+MOST_SAMPLES = 2_000_000
+"""Vertices that are learned from at most: each takes some 80 bytes of memory."""
 RATE = 3e-2
-"""Highest learning rate of the first training, up to UPDATES; a longer one learns more slowly."""
+"""Highest learning rate of a first training of up to UPDATES; that of a longer one falls as the
+root of its length, or it diverges."""
 RATE_AGAIN = 1e-2
-"""Highest learning rate of further trainings and of long ones."""
+"""That of further trainings."""
 MOST_AHEAD = 1.2
 """Factor of the steps of two passes that is believed at most."""
 LEFT = 0.97
@@ -101,6 +106,17 @@ def likely_widths(size: float, gain: float, access: str) -> Widths:
         return size * share - WEIGHT_BYTES * weights_of(of)
 
     return max(list(GAIN_BY_WIDTHS)[: MOST_WIDTHS[access]], key=saved)
+
+
+def least_gain(task: PlanTask) -> float:
+    """Return the gain in dB of least squares below which nothing is trained.
+
+    Who wishes for the fewest bytes pays the seconds of a training for little, and who asks for one
+    has it.
+    """
+    if task.config.train != "auto":
+        return -math.inf
+    return LEAST_GAIN / 3 if task.config.access == "small" else LEAST_GAIN
 
 
 def expected_share(foretold: float) -> float:
@@ -218,6 +234,7 @@ def _trained(
     if task.goal.psnr is not None and not parts.complete:  # their PSNR is not that of all tiles
         promise = parts.run(at, attempt.coding).psnr(data_range) + AIM_OF_MLP
     updates, count = training_length(task, widths)
+    slower = math.sqrt(min(UPDATES / updates, 1.0))
     lengths = [updates, *[max(1, round(AGAIN * updates))] * (count - 1)]
     for number, length in enumerate(lengths):
         coded = alone if trained is None else _left_to(trained.head, parts, alone)
@@ -228,8 +245,8 @@ def _trained(
             widths,
             Budget(
                 updates=length,
-                samples=SAMPLES,
-                rate=RATE if number == 0 and updates <= UPDATES else RATE_AGAIN,
+                samples=min(max(SAMPLES, SAMPLES_OF_UPDATE * updates), MOST_SAMPLES),
+                rate=(RATE if number == 0 else RATE_AGAIN) * slower,
             ),
             seed=task.config.seed + number,
             progress=_report(task, sum(lengths[:number]), length, sum(lengths)),

@@ -29,7 +29,7 @@ from fhash_codec.compact.goal import (
     step_after,
     with_step,
 )
-from fhash_codec.compact.head import LEAST_GAIN, choose_head, expected_share, training_pairs
+from fhash_codec.compact.head import choose_head, expected_share, least_gain, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
 from fhash_codec.compact.planner import block_of, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
@@ -480,9 +480,7 @@ def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Att
         pairs = training_pairs(attempt.parts, attempt.moved, coding)
         low, high = attempt.settings.low, attempt.settings.high
         gain = foretold_gain(pairs, low, high, task.config.seed)
-    # Who wishes for the fewest bytes pays the seconds of a training for little.
-    asked = task.config.access == "small" or task.config.train != "auto"
-    if gain < (0 if asked else LEAST_GAIN):
+    if gain < least_gain(task):
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
     if expected_share(gain) * attempt.outcome.size > beside:
@@ -530,6 +528,8 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
 
 LEARNED = 6 << 20
 """Vertices of the tiles that are learned from, unless a single one has more."""
+
+
 def predicted_or_corrected(task: PlanTask, attempt: Attempt) -> Attempt:
     """Return the plan with a head, or with a predictor under a strict bound, if that is smaller."""
     settings = _predictor_of(task, attempt)

@@ -172,7 +172,17 @@ def test_ctrl_c_after_the_file_was_written_says_so(
 def test_explain_says_what_took_the_time_and_what_was_left_out(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
-    words = ("encode", data, "-o", tmp_path / "run.fhz", *SMALL, "--without", "ssim", "--train", "none")
+    words = (
+        "encode",
+        data,
+        "-o",
+        tmp_path / "run.fhz",
+        *SMALL,
+        "--without",
+        "ssim",
+        "--train",
+        "none",
+    )
     result = fhash(*words, "--explain")
     assert (result.exit_code, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
