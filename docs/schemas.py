@@ -78,9 +78,8 @@ RenderBench.summary Switch.ratio
 """
 """Properties and methods of dataclasses whose values stand beside their fields in JSON."""
 ELSEWHERE = """
-fhash_bench.paper.printed.TableReport fhash_codec.cost.encodings.ModelsCompared
-fhash_codec.cost.prediction.TimeBudget fhash_codec.rendering.tracking.Followed
-fhash_codec.simulation.simulate.Counts
+fhash_bench.paper.printed.TableReport fhash_codec.cost.prediction.TimeBudget
+fhash_codec.rendering.tracking.Followed fhash_codec.simulation.simulate.Counts
 """
 """Records whose names the modules of commands know only to mypy, so that they start fast."""
 TYPES = {

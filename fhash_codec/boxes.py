@@ -262,9 +262,9 @@ class ArrayLike:
 
 
 CORNERS = "corners"
-"""Stencil of the profile paper: the 16 corners around a point in every level, interpolated."""
+"""Stencil of the published network: the 16 corners around a point in every level, interpolated."""
 NEIGHBOURS = "neighbours"
-"""Stencil of the profile compact: a vertex of level 1 and its neighbours."""
+"""Stencil of other files: a vertex of level 1 and its neighbours."""
 
 TABLE_AXES = (*AXES, "embedding")
 """Names of the axes of a table."""
@@ -326,7 +326,7 @@ class Mlp:
         activation: function between layers, "relu" or "leaky" (slope 1/8 below 0); "" where there
             are no layers, so that the values are those of the table.
         stencil: what the first layer sees, `CORNERS` or `NEIGHBOURS`.
-        constants: further numbers of the head of the profile compact: `sigma`, `low` and `high`, in
+        constants: further numbers where the stencil is NEIGHBOURS: `sigma`, `low` and `high`, in
             data units, and `cross`, 1 where the second layer sees the first one's outputs at nine
             vertices.
     """

@@ -32,6 +32,7 @@ from fhash_codec.progress import Progress, Stage, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Place
+from fhash_formats.container.header import PAPER
 from fhash_formats.container.reader import Split
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series, step_blocks
@@ -60,7 +61,7 @@ class Report(Sizes):
     max_abs_error: Annotated[float | None, "largest error in the coreset, in data units"]
     ssim: Annotated[float | None, "mean structural similarity over the coreset"]
     psnr_domain: Annotated[float | None, "dB over all, background outside the coreset"]
-    epochs: Annotated[int, "of the training; of the head in the profile compact, 0 without one"]
+    epochs: Annotated[int, "of the training; 0 without one"]
     curve: Annotated[list[HistoryPoint], "course of the training"]
     shape: Annotated[list[int], "of the series, (t, z, y, x)"]
     key_frames: Annotated[list[int], "steps that were encoded"]
@@ -68,11 +69,11 @@ class Report(Sizes):
     coreset_fraction: Annotated[float, "share of the domain that is kept, 0 to 1"]
     data_range: Annotated[float, "largest less smallest value"]
     parameters: Annotated[int, "numbers of the model other than 0"]
-    profile: Annotated[Literal["compact", "paper"], "the model"]
+    published: Annotated[bool, "whether it is the published network"]
     tables_loss_db: Annotated[float | None, "dB that coded tables lose at the key frames"]
     device: Annotated[Literal["cpu", "cuda"], "where it was trained"]
     restarts: Annotated[int, "times that the training diverged and began again, slower"]
-    gains: Annotated[list[Gain], "what the search of the profile compact went through"]
+    gains: Annotated[list[Gain], "what the search went through; empty for the published network"]
     quality: Annotated[dict[str, Any], Quality, "all figures of the quality"]
 
 
@@ -122,7 +123,7 @@ def report(
         "coreset_fraction": info["coreset_fraction"],
         "data_range": volume.value_range.high - volume.value_range.low,
         "parameters": info["model"]["parameters"],
-        "profile": info["model"]["profile"],
+        "published": info["model"]["profile"] == PAPER,
         "tables_loss_db": info["model"].get("tables_loss_db"),
         # What is not trained is computed on the CPU.
         "device": "cpu" if device == "none" else device,

@@ -15,20 +15,20 @@ from fhash_codec.records import Record, limits
 from fhash_formats.errors import InputError, suggestion
 
 TABLES = ("auto", "float32", "float16", "uint8", "sparse", "dense", "transform")
-"""Storage of the paper profile's tables: the codec, a number type, or float16 of some vertices."""
+"""Storage of the published network's tables: the codec, a number type, float16 of some vertices."""
 
-NAMED_PROFILES = {"lattice": "compact", "network": "paper"}
-"""Profiles by the names of what they fit."""
-AUTO = "auto"
-"""Profile that stands for one of the others (`cost.encodings.choose_model`)."""
-MODELS = {"compact": "lattice", "paper": "network (F-Hash)"}
-"""Names of what the profiles fit, for people."""
+PUBLISHED = "published"
+"""Preset of the published network."""
+ACCESS = {"default": "balanced", "small": "small", "fast": "fast", PUBLISHED: "balanced"}
+"""Wishes for access to regions, by the presets."""
+PRESETS = tuple(ACCESS)
+"""Every preset, the default first."""
 
 ENGINES = ("fused", "native", "slab")
-"""Training engines of the paper profile, the fastest first; `fused` is for CUDA alone."""
+"""Training engines of the published network, the fastest first; `fused` is for CUDA alone."""
 
 SAMPLES = ("all", "keys", "published")
-"""Samples that the profile paper trains on."""
+"""Samples that the published network trains on."""
 
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""
@@ -36,11 +36,8 @@ PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 OPTIONAL_STAGES = ("tiles", "transform", "filling", "predictor", "ssim")
 """Stages of an encoding that `without` may name."""
 
-STAGES_OF_PAPER = ("ssim",)
-"""Those of them that the profile paper has."""
-
-ACCESSES = ("fast", "balanced", "small")
-"""Wishes for access to regions, those that may cost the most bytes first."""
+STAGES_OF_PUBLISHED = ("ssim",)
+"""Those of them that the published network has."""
 
 PAIR = ("psnr", "psnr_bulk")
 """Promises that may be given together."""
@@ -63,12 +60,13 @@ MOST_TRAINING_SECONDS = 86400.0
 class EncodeConfig(Record):
     """Settings of `encode`; raises InputError for a value that is not allowed."""
 
-    profile: str = limits(
-        "compact",
-        "'lattice' or 'compact' is the smallest file at a promised quality; "
-        "'network' or 'paper' is the published F-Hash, trained from a random start; "
-        "'auto' fits both to a crop, prints what each costs, and takes one by the access",
-        choices=("compact", "paper", *NAMED_PROFILES, AUTO),
+    preset: str = limits(
+        "default",
+        "what reading may cost: 'default' is a region of 16^3 within 30 ms and 100 MB/s where "
+        "small tiles or the fast coder give that for up to 1.1 times the bytes; 'small' is the "
+        "fewest bytes; 'fast' is 3 ms, the fast coder and up to 1.5 times the bytes; or "
+        "'published', the network of the paper, trained from a random start",
+        choices=PRESETS,
     )
     features: tuple[str, ...] = limits(
         ("all",),
@@ -79,81 +77,83 @@ class EncodeConfig(Record):
     dilation: int = limits(1, "vertices by which features grow in every direction", low=0, high=64)
     key_frames: str = limits(
         "all",
-        "paper: steps to train on, as all, every:K, auto:N (N chosen by interpolation error) "
+        "published: steps to train on, as all, every:K, auto:N (N chosen by interpolation error) "
         "or a list such as 0,4,9",
-        profile="paper",
+        published=True,
     )
     samples: str = limits(
         "all",
-        "paper: train on 'all' steps from the first key frame to the last, each at its place in "
-        "time, or on the 'keys' alone; with either, on the vertices that only a neighbouring key "
-        "frame selects, too, or without them on the keys, as 'published'",
+        "published: train on 'all' steps from the first key frame to the last, each at its place "
+        "in time, or on the 'keys' alone; with either, on the vertices that only a neighbouring "
+        "key frame selects, too, or without them on the keys, as 'published'",
         choices=SAMPLES,
-        profile="paper",
+        published=True,
     )
     fold: int = limits(
         0,
-        "paper: ratio of resolution from one level to the next, 2 to 64; 0 for 2, the published "
-        "one, or 8 where tables are coded, of which more levels cost bytes",
+        "published: ratio of resolution from one level to the next, 2 to 64; 0 for 2, the paper's, "
+        "or 8 where tables are coded, of which more levels cost bytes",
         low=0,
         high=64,
-        profile="paper",
+        published=True,
     )
     embedding_size: int = limits(
         0,
-        "paper: numbers trained at each grid corner; 0 for 2, the published size, or 1 where "
+        "published: numbers trained at each grid corner; 0 for 2, the published size, or 1 where "
         "tables are coded",
         low=0,
         high=16,
-        profile="paper",
+        published=True,
     )
     hidden_layers: int = limits(
-        2, "paper: hidden layers of the network", low=0, high=8, profile="paper"
+        2, "published: hidden layers of the network", low=0, high=8, published=True
     )
     width: int = limits(
         0,
-        "paper: neurons of each hidden layer; 0 for 64, the published width, or 16 where "
+        "published: neurons of each hidden layer; 0 for 64, the published width, or 16 where "
         "tables are coded",
         low=0,
         high=1024,
-        profile="paper",
+        published=True,
     )
     epochs: int = limits(
         0,
-        "paper: passes over the coreset, no fewer and no more; 0 for 20 or as many as make 1000 "
-        "training steps, and then more until the promise is kept",
+        "published: passes over the coreset, no fewer and no more; 0 for 20 or as many as make "
+        "1000 training steps, and then more until the promise is kept",
         low=0,
         high=100_000,
-        profile="paper",
+        published=True,
     )
     train_on_seconds: int = limits(
         TRAIN_ON_SECONDS,
-        "paper: seconds of wall time that training may take beyond its first epochs where coded "
-        "tables would miss the promise; --epochs leaves none",
+        "published: seconds of wall time that training may take beyond its first epochs where "
+        "coded tables would miss the promise; --epochs leaves none",
         low=0,
         high=10**9,
-        profile="paper",
+        published=True,
     )
     learning_rate: float = limits(
-        0.01, "paper: Adam's learning rate at the start", low=1e-8, high=1.0, profile="paper"
+        0.01, "published: Adam's learning rate at the start", low=1e-8, high=1.0, published=True
     )
     schedule: str = limits(
         "cosine",
-        "paper: course of the learning rate over the training",
+        "published: course of the learning rate over the training",
         choices=("cosine", "constant"),
-        profile="paper",
+        published=True,
     )
     batch: int = limits(
         0,
-        "paper: samples per training step, of the coreset alone; 0 for a size that suits the data",
+        "published: samples per training step, of the coreset alone; 0 for a size that suits the "
+        "data",
         low=0,
         high=2**31,
-        profile="paper",
+        published=True,
     )
     brick: str = limits(
         "auto",
-        "paper: vertices that are trained together, as ZxYxX such as 8x8x16; 'auto' for about 1024",
-        profile="paper",
+        "published: vertices that are trained together, as ZxYxX such as 8x8x16; 'auto' for about "
+        "1024",
+        published=True,
     )
     psnr: float | None = limits(
         None,
@@ -172,75 +172,67 @@ class EncodeConfig(Record):
     )
     max_error: float | None = limits(
         None,
-        "compact: strict bound of the error of each value, in data units",
+        "strict bound of the error of each value, in data units",
         low=0.0,
         high=1.7e308,
     )
     max_error_rel: float | None = limits(
         None,
-        "compact: strict bound of the error of each value, as a fraction of the range of the "
-        "series",
+        "strict bound of the error of each value, as a fraction of the range of the series",
         low=0.0,
         high=1.0,
     )
     ratio: float | None = limits(
         None,
-        "compact: make the file this many times smaller than the raw data",
+        "make the file this many times smaller than the raw data",
         low=1.0,
         high=1e9,
-        profile="compact",
+        published=False,
     )
     effort: int = limits(
         5,
-        "compact: 1 prices few candidates and codes in one pass, 2 to 4 price more and weigh bits, "
+        "1 prices few candidates and codes in one pass, 2 to 4 price more and weigh bits, "
         "from 5 on an MLP is trained, the longer the higher",
         low=1,
         high=9,
-        profile="compact",
+        published=False,
     )
     train: str = limits(
         "auto",
-        "compact: how long the MLP behind the table is trained: 'auto' where it should pay and as "
+        "how long the MLP behind the table is trained: 'auto' where it should pay and as "
         "long as the effort says, 'none', or a time such as 30s or 5m of one core, which becomes a "
         "number of updates",
-        profile="compact",
+        published=False,
     )
     tile: str = limits(
         "auto",
-        "compact: vertices that are decoded together, as TxZxYxX such as 4x32x32x32; "
+        "vertices that are decoded together, as TxZxYxX such as 4x32x32x32; "
         "'auto', or 'whole' for one tile",
-        profile="compact",
-    )
-    access: str = limits(
-        "balanced",
-        "compact: what reading may cost: 'small' for the fewest bytes; 'balanced' for a region of "
-        "16^3 within 30 ms and 100 MB/s where small tiles or the fast coder give that for up to "
-        "1.1 times the bytes; 'fast' for 3 ms, the fast coder and up to 1.5 times the bytes",
-        choices=ACCESSES,
-        profile="compact",
+        published=False,
     )
     without: tuple[str, ...] = limits(
         (),
         "stages to leave out, which then take no time: tiles, transform, filling, predictor "
-        "(trials of compact, for fewer bytes) and ssim; repeat, or join by commas",
+        "(trials for fewer bytes) and ssim; repeat, or join by commas",
     )
     tables: str = limits(
         "auto",
-        "paper: 'auto' codes the tables as compact does, down to the promise; 'transform' too, for "
-        "at most 0.1 dB where none is given; others are plain numbers of a type, which have only "
-        "the vertices that the coreset needs where it is below half of its box; 'sparse' (always "
-        "so) and 'dense' (never) are float16; only 'auto' has a promise where none is given",
+        "published: 'auto' codes the tables as other presets do, down to the promise; 'transform' "
+        "too, for at most 0.1 dB where none is given; others are plain numbers of a type, which "
+        "have only the vertices that the coreset needs where it is below half of its box; 'sparse' "
+        "(always so) and 'dense' (never) are float16; only 'auto' has a promise where none is "
+        "given",
         choices=TABLES,
-        profile="paper",
+        published=True,
     )
     engine: str = limits(
-        "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
+        "auto", "published: training engine", choices=("auto", *ENGINES), published=True
     )
     device: str = limits(
-        "auto", "paper: where to train", choices=("auto", "cpu", "cuda"), profile="paper"
+        "auto", "published: where to train", choices=("auto", "cpu", "cuda"), published=True
     )
     deterministic: bool = limits(
-        False, "paper: the same bits in every run on CUDA, too; slower there", profile="paper"
+        False, "published: the same bits in every run on CUDA, too; slower there", published=True
     )
     seed: int = limits(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = limits(
@@ -258,16 +250,16 @@ class EncodeConfig(Record):
             raise InputError(
                 "--fold is 1; allowed: 2 to 64, or 0 for a ratio that suits the tables"
             )
-        self._check_profile()
+        self._check_preset()
         self._check_without()
         if self.epochs and self.train_on_seconds not in (0, TRAIN_ON_SECONDS):
             raise InputError(
                 "epochs and train-on-seconds are given; --epochs trains no more than that: "
                 "give one of them"
             )
-        if self.access != "balanced" and self.tile != "auto":
+        if self.preset in ("small", "fast") and self.tile != "auto":
             raise InputError(
-                f"access '{self.access}' and tile '{self.tile}' are given; a tile that is named "
+                f"preset '{self.preset}' and tile '{self.tile}' are given; a tile that is named "
                 "leaves nothing to choose: give one of them"
             )
         self._check_promises()
@@ -280,20 +272,19 @@ class EncodeConfig(Record):
         return name.replace("_", "-")
 
     @property
-    def coded(self) -> bool:
-        """Whether the profile paper's tables are coded, and no plain numbers."""
-        return self.tables in ("auto", "transform")
+    def published(self) -> bool:
+        """Whether the published network is trained."""
+        return self.preset == PUBLISHED
 
-    def of_profile(self, profile: str) -> EncodeConfig:
-        """The settings for one profile, without those of the other."""
-        changes: dict[str, Any] = {
-            field.name: field.default
-            for field in dataclasses.fields(self)
-            if field.metadata.get("profile") not in (None, profile)
-        }
-        if profile == "paper":
-            changes["without"] = tuple(name for name in self.without if name in STAGES_OF_PAPER)
-        return dataclasses.replace(self, profile=profile, **changes)
+    @property
+    def access(self) -> str:
+        """The wish for access to regions: 'fast', 'balanced' or 'small'."""
+        return ACCESS[self.preset]
+
+    @property
+    def coded(self) -> bool:
+        """Whether the published network's tables are coded, and no plain numbers."""
+        return self.tables in ("auto", "transform")
 
     @property
     def training_seconds(self) -> float | None:
@@ -319,7 +310,7 @@ class EncodeConfig(Record):
 
     @property
     def model_fold(self) -> int:
-        """The ratio of resolution of the profile paper's levels: `fold`, or what its 0 stands for.
+        """The published network's ratio of resolution of levels: `fold`, or what 0 stands for.
 
         Coded tables of more levels take more bytes at the same PSNR: the finest table describes the
         values alone, and the coarser ones repeat what it could say.
@@ -328,7 +319,7 @@ class EncodeConfig(Record):
 
     @property
     def model_embedding_size(self) -> int:
-        """Numbers at a grid corner of the profile paper: `embedding_size`, or what 0 stands for.
+        """The published network's numbers at a corner: `embedding_size`, or what 0 stands for.
 
         Of several numbers, coded tables use one: the coding turns the others into a constant.
         """
@@ -336,7 +327,7 @@ class EncodeConfig(Record):
 
     @property
     def model_width(self) -> int:
-        """Neurons of the profile paper's hidden layers: `width`, or what its 0 stands for.
+        """Neurons of the published network's hidden layers: `width`, or what its 0 stands for.
 
         A function of a few numbers needs few. Beside coded tables, 64 would take up to a quarter of
         the file.
@@ -362,8 +353,6 @@ class EncodeConfig(Record):
             raise InputError(
                 f"without names '{unknown[0]}'; {suggestion(unknown[0], OPTIONAL_STAGES)}"
             )
-        profile = NAMED_PROFILES.get(self.profile, self.profile)
-        object.__setattr__(self, "profile", profile)
         # One order, so that the same stages give the same bytes however they are named.
         in_order = tuple(name for name in OPTIONAL_STAGES if name in names)
         object.__setattr__(self, "without", in_order)
@@ -374,25 +363,25 @@ class EncodeConfig(Record):
         if not isinstance(key_frames, str):
             object.__setattr__(self, "key_frames", ",".join(str(int(step)) for step in key_frames))
 
-    def _check_profile(self) -> None:
-        """Raise InputError for a setting that belongs to the other profile."""
+    def _check_preset(self) -> None:
+        """Raise InputError for a setting that belongs to other presets."""
         for field in dataclasses.fields(self):
-            profile, value = field.metadata.get("profile"), getattr(self, field.name)
+            published, value = field.metadata.get("published"), getattr(self, field.name)
+            if published in (None, self.published) or value == field.default:
+                continue
             if field.name == "device" and value == "cpu":
-                continue  # where every other profile computes
-            if profile and self.profile not in (AUTO, profile) and value != field.default:
-                raise InputError(
-                    f"{self.label(field)} belongs to --profile {profile}; "
-                    f"the profile is {self.profile}"
-                )
+                continue  # where the other presets compute
+            belongs = f"belongs to --preset {PUBLISHED}; the preset is {self.preset}"
+            others = f"is not for --preset {PUBLISHED}"
+            raise InputError(f"{self.label(field)} {belongs if published else others}")
 
     def _check_without(self) -> None:
-        """Raise InputError for a stage to leave out that the profile does not have."""
-        others = [name for name in self.without if name not in STAGES_OF_PAPER]
-        if self.profile == "paper" and others:
+        """Raise InputError for a stage to leave out that the preset does not have."""
+        others = [name for name in self.without if name not in STAGES_OF_PUBLISHED]
+        if self.published and others:
             raise InputError(
-                f"without names '{others[0]}', a stage of --profile compact; "
-                f"the profile paper has {', '.join(STAGES_OF_PAPER)}"
+                f"without names '{others[0]}', which --preset {PUBLISHED} does not have; it has "
+                f"{', '.join(STAGES_OF_PUBLISHED)}"
             )
 
     def _check_promises(self) -> None:
@@ -405,11 +394,11 @@ class EncodeConfig(Record):
         if len(promised) > 1 and not {field.name for field in promised} <= set(PAIR):
             names = " and ".join(map(self.label, promised))
             raise InputError(f"{names} are given; promise one of them")
-        if self.profile == "paper" and self.bounded:
+        if self.published and self.bounded:
             raise InputError(
-                f"{self.label(promised[0])} is not for --profile network, whose float32 numbers "
-                "differ from machine to machine; leave --profile out for a bound (networks take "
-                "one again once their weights are integers), or promise --psnr"
+                f"{self.label(promised[0])} is not for --preset {PUBLISHED}, whose float32 numbers "
+                "differ from machine to machine; leave --preset out for a bound (the published "
+                "network takes one again once its weights are integers), or promise --psnr"
             )
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fhash_codec.compact.encode import DecodedTiles, encode_compact
 from fhash_codec.compact.goal import missed_promise, remarks
 from fhash_codec.comparison import EncodeReport, Sizes, measure, report, ssim_budget, steps_of_ssim
-from fhash_codec.config import AUTO, EncodeConfig
+from fhash_codec.config import EncodeConfig
 from fhash_codec.dataset import Dataset
 from fhash_codec.devices import choose_device
 from fhash_codec.features.selection import Source, mask_files, open_source
@@ -68,11 +68,11 @@ def encode(
         The source is a file that all workers see, or an array of dask, labelled or not; the
         promise is a bound of the error.
 
-    Returns the figures of the written file, and as "stages" what took the time. In the profile
-    paper Ctrl-C during the training saves a checkpoint beside `path` and raises
+    Returns the figures of the written file, and as "stages" what took the time. With
+    the preset published Ctrl-C during the training saves a checkpoint beside `path` and raises
     InterruptedEncodingError; the same call then continues from the checkpoint to the same result.
-    In the profile compact nothing is kept: KeyboardInterrupt passes through, and the same call
-    starts again.
+    With the others nothing is kept: KeyboardInterrupt passes through, and the same call starts
+    again.
 
     Raises InputError for a source or settings that cannot be encoded, or for a promise that is seen
     to be out of reach, and MissingDependencyError for CUDA without torch. Raises QualityError, with
@@ -163,19 +163,14 @@ def encode_variable(
 
     mask: as in `encode`. path: of the file, beside which checkpoints lie.
     """
-    if config.profile == AUTO:
-        raise InputError(
-            "the profile is 'auto': fhash_codec.cost.encodings.choose_model(series, config).config "
-            "has the one to take"
-        )
     measured = _Measured(writer, series, config, progress)
     checkpoint, advice, rounding = None, "", 0.0
-    if config.profile == "compact":
-        header = encode_compact(writer, series, config, mask, progress, measured.complete)
-    else:
+    if config.published:
         network = encode_paper(writer, series, config, mask, path, progress, measured.complete)
         header, checkpoint = network.header, network.checkpoint
         advice, rounding = network.advice, network.rounding
+    else:
+        header = encode_compact(writer, series, config, mask, progress, measured.complete)
     series.check()  # what was scanned, coded and measured is of one state
     figures = measured.figures(header)
     return EncodedVariable(

@@ -24,7 +24,7 @@ class HistoryPoint(TypedDict):
 
 
 class Gain(TypedDict):
-    """A part of the search of the profile compact, and what came of it."""
+    """A part of the search of an encoding, and what came of it."""
 
     what: Annotated[str, "the part"]
     bytes: Annotated[int, "size of the file after it, estimated but for the last"]

@@ -29,7 +29,6 @@ from fhash_formats.container import (
     read_metadata,
 )
 from fhash_formats.container.header import (
-    CONFIG_DEFAULTS,
     HISTORY,
     LOWEST,
     MISSING_ARRAY,
@@ -151,11 +150,9 @@ def history_line(header: Mapping[str, Any]) -> str:
 
 def _options(header: Mapping[str, Any]) -> list[str]:
     """The settings other than the defaults, as options of the command line."""
-    config, profile = header.get("config", {}), header["model"]["profile"]
-    defaults = EncodeConfig(profile=profile).to_dict() | {"profile": CONFIG_DEFAULTS["profile"]}
     return [
         option if value is None else f"{option} {str(value)[:MAX_OPTION]}"
-        for option, value in options_beyond(config, defaults)
+        for option, value in options_beyond(header.get("config", {}), EncodeConfig().to_dict())
     ]
 
 
@@ -299,10 +296,10 @@ def _step_figure(lowest: int, level: int, data_range: float, limit: float | None
 
 
 MAX_POINTS = 24
-"""Points of a training history that a file of the profile paper keeps at most."""
+"""Points of a training history that a file of the published network keeps at most."""
 
 HEAD_POINTS = 8
-"""Points that a file of the profile compact keeps at most, of the training of its head."""
+"""Points that another file keeps at most, of the training of its head."""
 
 DIGITS = 6
 """Significant digits of a figure over all steps."""

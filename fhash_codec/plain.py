@@ -71,7 +71,7 @@ def export_plain(
 
     The new file decodes to the same values, integers of any size included, and within rounding to
     float32 or float64 where the source has corrections of floats (a bounded error). Levels of
-    detail of the profile compact are there down to a lattice of 2 vertices.
+    detail are there down to a lattice of 2 vertices.
 
     Raises InputError for a name of a data file or the source itself, OutputExistsError without
     force, and OutputError where the file cannot be written.
@@ -113,7 +113,7 @@ class _Export:
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:
-        """Write a file of the profile paper: arrays decoded, tables and occupancy whole."""
+        """Write the published network: arrays decoded, tables and occupancy whole."""
         model = self._header["model"]
         # Coded tables become numbers, and tables of needed vertices get all others as well.
         coded = [
@@ -155,7 +155,7 @@ class _Export:
         }
 
     def compact(self) -> dict[str, Any]:
-        """Write a file of the profile compact: all levels, the head, bits, and corrections."""
+        """Write another model: all levels, the head, bits, and corrections."""
         volume = self._volume
         array = self._arrays["tables/level_1"]
         tables, settings = volume.tables, array.settings
@@ -287,7 +287,7 @@ class _Export:
                 self._writer.add_whole(f"mlp/{name}_{number}", values, attributes=attributes)
 
     def _write_occupancy(self, keys: int) -> None:
-        """Write the bits of every key frame, in the profile paper those of each feature."""
+        """Write the bits of every key frame, of the published network those of each feature."""
         model, box = self._volume._model, self._volume.box.shape
         region = Box.of_shape(box)
         count = len(self._header["features"]) if isinstance(model, PaperModel) else 1

@@ -134,7 +134,7 @@ def limits(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
-    **more: str,
+    **more: str | bool,
 ) -> Any:
     """Declare a field of a Record with its help and the values that it may have.
 

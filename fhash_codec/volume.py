@@ -378,7 +378,7 @@ class Volume(Card, ArrayLike):
 
         Neither finer detail nor other tiles are decoded. Vertices outside the coreset are NaN. Only
         compact files have levels of detail. Raises RegionError for a step outside the series and
-        for a region without such a vertex, InputError for another profile or another lod.
+        for a region without such a vertex, InputError for the published network or another lod.
         """
         values, occupied = self.decoded_lod(t, lod, region)
         values = values.astype(self.float_dtype)
@@ -488,7 +488,7 @@ class Volume(Card, ArrayLike):
         """Mask (z, y, x) of the vertices of a region that are in the coreset at step `t`.
 
         region: in vertices of the domain; the whole domain if None. Between key frames a vertex
-        must be in the coreset at either of the two; in the profile compact, at both. Raises
+        must be in the coreset at both of the two; of the published network, at either. Raises
         RegionError for a step or region outside the domain.
         """
         key, region = self._key_index(t), self._checked(region)
@@ -628,7 +628,7 @@ class FeatureVolume(Volume):
         """Mask (z, y, x) of the features' coreset at a key index; region in vertices of the box."""
         from fhash_codec.paper.model import PaperModel
 
-        assert isinstance(self._model, PaperModel), "only_features refuses other profiles"
+        assert isinstance(self._model, PaperModel), "only_features refuses other models"
         first, last = int(np.floor(key)), int(np.ceil(key))
         return self._model.occupied_by(self.numbers, first, last, region)
 
@@ -656,7 +656,7 @@ def only_features(volume: Volume, features: Sequence[str]) -> Volume:
     if not holds_features_apart(volume):
         raise InputError(
             f"{volume.path}: its features are merged, none can be taken alone; "
-            "encode with --profile paper, which keeps several features apart"
+            "encode with --preset published, which keeps several features apart"
         )
     return FeatureVolume(volume.container, numbers, fill=volume._asked_fill)
 

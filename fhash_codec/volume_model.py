@@ -1,4 +1,4 @@
-"""Model behind a volume, the same for every profile: its card, and values between vertices."""
+"""Model behind a volume, the same for every preset: its card, and values between vertices."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ class Card:
     def tables(self) -> list[Table]:
         """Tables (t, z, y, x, E) of the levels, finest first, decoded as they are read.
 
-        t counts key frames; z, y, x count vertices of the level in the feature bounding box. In the
-        profile paper a table holds E embeddings at each vertex. In the profile compact E is 1:
+        t counts key frames; z, y, x count vertices of the level in the feature bounding box. A
+        table of the published network holds E embeddings at each vertex. In other files E is 1:
         level 1 holds the values before the head corrects them, and level l the low-passed lattice
         of every 2^(l-1)-th vertex along z, y and x.
         """
@@ -114,9 +114,9 @@ class Card:
     def mlp(self) -> Mlp:
         """Weights (outputs, inputs) and biases (outputs,) of each layer, float32.
 
-        The first layer sees the L E interpolated embeddings of a point in the profile paper; in the
-        profile compact 28 functions of a vertex and its neighbours in the table of level 1. There
-        are no layers where a compact file has no head.
+        The first layer sees the L E interpolated embeddings of a point in the published network;
+        in other files 28 functions of a vertex and its neighbours in the table of level 1. There
+        are no layers where such a file has no head.
         """
         return self._model.mlp
 

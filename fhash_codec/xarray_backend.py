@@ -323,7 +323,8 @@ class FhashBackend(BackendEntrypoint):
     ) -> xr.Dataset:
         """Open a container as a lazy dataset; the options of CF are xarray's own.
 
-        lod: level of detail, every 2^lod-th vertex of the feature bounding box (profile compact).
+        lod: level of detail, every 2^lod-th vertex of the feature bounding box; the published
+            network has none but 0.
         outside: "nan", or "background" for the mean of the values outside the coreset.
         variable: the only one wanted; all by default.
         storage_options: of a URL.

@@ -58,7 +58,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     np.save(folder / "data.npy", (1 / (1 + np.exp(-2 * front))).astype(np.float32))
     commands = {
         "encode": "encode data.npy -o run.fhz --json",
-        "paper": "encode data.npy -o network.fhz --profile=paper --tables=dense --epochs=2",
+        "paper": "encode data.npy -o network.fhz --preset=published --tables=dense --epochs=2",
         "decode": "decode run.fhz --t 1 -o step.npy",
         "render": "render run.fhz -o step.png --size 64x64",
         "stream": "render network.fhz -o stream.png --size 16x16 --march stream",
@@ -107,10 +107,10 @@ def test_what_needs_torch_says_so_in_one_line(
 def test_a_device_for_compact_is_refused(results: dict[str, Any]) -> None:
     code, _, errors = results["compact on cuda"]
     assert code == 2
-    assert "device belongs to --profile paper" in errors
+    assert "device belongs to --preset published" in errors
 
 
 def test_a_benchmark_trains_the_network_and_names_no_torch(results: dict[str, Any]) -> None:
     report = json.loads(results["bench rate"][1])
-    assert {point["codec"] for point in report["points"]} == {"fhash compact", "fhash paper"}
+    assert {point["codec"] for point in report["points"]} == {"fhash default", "fhash published"}
     assert "torch" not in report["machine"]

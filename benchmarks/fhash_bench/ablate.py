@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from fhash_bench.kept import save
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import PUBLISHED, EncodeConfig
 from fhash_codec.cost.report import require_matplotlib
 from fhash_codec.devices import machine
 from fhash_codec.encoding import encode
@@ -36,7 +36,7 @@ class Axis:
 
     Attributes:
         name: name on the command line.
-        profile: profile of the base.
+        preset: of the base.
         varied: settings of each model; the names are fields of `EncodeConfig`, and what is not
             named has its default.
         reference: number of the one in `varied` that the others are compared with: the default.
@@ -45,7 +45,7 @@ class Axis:
     """
 
     name: str
-    profile: str
+    preset: str
     varied: tuple[dict[str, Any], ...]
     why: str
     reference: int = 0
@@ -65,59 +65,59 @@ def _grid(first: str, ones: Sequence[Any], second: str, others: Sequence[Any]) -
 AXES = (
     Axis(
         name="encoding",
-        profile="paper",
+        preset="published",
         varied=_grid("fold", (2, 4, 6), "embedding_size", (1, 2, 4, 8)),
         reference=1,
         why="ratio of resolution between levels, and numbers at a grid corner (paper, Table 1)",
     ),
     Axis(
         name="network",
-        profile="paper",
+        preset="published",
         varied=_grid("hidden_layers", (1, 2, 3, 4), "width", (16, 32, 64, 128)),
         reference=6,
         why="layers and neurons of the MLP (paper, Ablation Study)",
     ),
     Axis(
         name="key-frames",
-        profile="paper",
+        preset="published",
         varied=_one("key_frames", "all", "every:2", "every:4", "auto:10"),
         why="steps that are trained; quality is measured on all steps",
     ),
     Axis(
         name="dilation",
-        profile="paper",
+        preset="published",
         varied=_one("dilation", 0, 1, 2, 4),
         reference=1,
         why="vertices by which the feature grows",
     ),
     Axis(
         name="samples",
-        profile="paper",
+        preset="published",
         varied=_one("samples", "all", "keys", "published"),
         common=(("key_frames", "every:4"),),
         why="steps between key frames, and vertices of one neighbour alone, with every 4th step",
     ),
     Axis(
         name="brick",
-        profile="paper",
+        preset="published",
         varied=_one("brick", "auto", "4x4x4", "4x4x8", "4x8x8", "8x8x8", "8x8x16", "16x16x16"),
         why="vertices that are trained together",
     ),
     Axis(
         name="batch",
-        profile="paper",
+        preset="published",
         varied=_one("batch", 0, 1 << 12, 1 << 14, 1 << 16, 1 << 18, 1 << 21),
         why="samples of a training step; 0 is the product's own choice, 2^21 the paper's",
     ),
     Axis(
         name="schedule",
-        profile="paper",
+        preset="published",
         varied=_one("schedule", "cosine", "constant"),
         why="course of the learning rate; constant is the paper's",
     ),
     Axis(
         name="tables",
-        profile="paper",
+        preset="published",
         varied=(
             *_one("tables", "float32", "float16", "uint8", "sparse", "dense"),
             {"tables": "transform", "fold": 2, "embedding_size": 2, "width": 64},
@@ -129,26 +129,26 @@ AXES = (
     ),
     Axis(
         name="effort",
-        profile="compact",
+        preset="default",
         varied=_one("effort", 1, 2, 3, 4, 5, 7, 9),
         reference=4,
-        why="trials and training of the profile compact",
+        why="trials and training of the default preset",
     ),
     Axis(
         name="tile",
-        profile="compact",
+        preset="default",
         varied=_one("tile", "auto", "whole", "4x16x16x16", "4x32x32x32", "16x16x16x16"),
         why="vertices that are decoded together",
     ),
     Axis(
         name="stages",
-        profile="compact",
+        preset="default",
         varied=_one("without", (), ("tiles",), ("transform",), ("head",)),
         why="stages of the encoding, each left out",
     ),
     Axis(
         name="stages-of-bound",
-        profile="compact",
+        preset="default",
         varied=_one("without", (), ("tiles",), ("transform",), ("head",), ("predictor",)),
         why="the same for a strict bound of 1 % of the range, whatever is promised otherwise",
         common=(("psnr", None), ("max_error", None), ("max_error_rel", 0.01)),
@@ -215,7 +215,7 @@ class Run:
         reference: whether the axis's others are compared with it.
         seed: seed of the random choices.
         seconds: time of the whole encoding.
-        training_seconds: time of the training; None in the profile compact.
+        training_seconds: time of the training; None but for the published network.
         epochs: epochs of the training, 0 without one.
         bytes: size of the file.
         parameters: numbers of the model.
@@ -289,7 +289,7 @@ class AblateBench:
 
     Attributes:
         series: name of the series. shape: (t, z, y, x). features: what was encoded.
-        common: settings of all encodings of a profile.
+        common: settings of all encodings of a preset.
         runs: all encodings.
         left_out: a line for each variation that was not measured, with the reason.
         machine: what the encodings ran on.
@@ -408,8 +408,8 @@ def bench_ablate(
     }
     common: dict[str, dict[str, Any]] = {
         # Tables of numbers have no default promise, which would end a training where it is kept.
-        "paper": {"tables": "float16", **settings, "profile": "paper", "epochs": epochs},
-        "compact": {**settings, **promise, "profile": "compact"},
+        PUBLISHED: {"tables": "float16", **settings, "preset": PUBLISHED, "epochs": epochs},
+        "default": {**settings, **promise, "preset": "default"},
     }
     with open_source(source) as series, tempfile.TemporaryDirectory() as scratch:
         work = _Work(series, common, Path(scratch), folder, progress)
@@ -418,7 +418,7 @@ def bench_ablate(
         series=f"{series.source} {series.name}".strip(),
         shape=tuple(series.shape),
         features=tuple(settings.get("features", ("all",))),
-        common={axis.profile: common[axis.profile] for axis in axes},
+        common={axis.preset: common[axis.preset] for axis in axes},
         runs=tuple(work.runs),
         left_out=tuple(work.left_out),
         machine=machine(),
@@ -459,7 +459,7 @@ class _Work:
 
     def _one(self, axis: Axis, varied: dict[str, Any], seed: int) -> None:
         """Encode one variation, unless it is finished already."""
-        settings = {**self._common[axis.profile], **dict(axis.common), **varied, "seed": seed}
+        settings = {**self._common[axis.preset], **dict(axis.common), **varied, "seed": seed}
         config = EncodeConfig.from_dict(settings)
         kept = None if self._folder is None else self._folder / self._name(axis, varied, config)
         if kept is not None and kept.exists():
@@ -532,9 +532,9 @@ def _run(axis: Axis, varied: dict[str, Any], seed: int, figures: dict[str, Any])
         reference=varied == axis.varied[axis.reference],
         seed=seed,
         seconds=figures["seconds"],
-        training_seconds=curve[-1].get("seconds") if axis.profile == "paper" and curve else None,
+        training_seconds=curve[-1].get("seconds") if axis.preset == PUBLISHED and curve else None,
         epochs=figures["epochs"],
-        curve=tuple(curve) if axis.profile == "paper" else (),
+        curve=tuple(curve) if axis.preset == PUBLISHED else (),
         **{
             field.name: figures[field.name]
             for field in dataclasses.fields(Run)
@@ -554,8 +554,8 @@ STYLES = ("-", "--", ":", "-.")
 def plot(result: AblateBench, path: Path) -> None:
     """Draw a result as a PNG at `path`.
 
-    An axis of the profile paper shows PSNR over the epochs of each training; one of the profile
-    compact bytes against seconds: its models keep the same promise.
+    An axis of the preset published shows PSNR over the epochs of each training; one of the
+    default bytes against seconds: its models keep the same promise.
     """
     figure_module = require_matplotlib()
     axes = list(dict.fromkeys(run.axis for run in result.runs))

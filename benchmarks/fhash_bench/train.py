@@ -256,7 +256,7 @@ def bench_train(
         InputError: an engine is unknown or does not take the model, or the seconds or bricks are
             not positive.
     """
-    config = config or EncodeConfig(profile="paper", tables="float16")
+    config = config or EncodeConfig(preset="published", tables="float16")
     if seconds <= 0 or min(bricks, default=1) < 1:
         raise InputError(
             f"seconds is {seconds:g}, bricks are {list(bricks)}; positive numbers are needed"

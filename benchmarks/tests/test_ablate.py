@@ -31,12 +31,12 @@ from fhash_formats.errors import InputError
 FEW = (
     Axis(
         name="schedule",
-        profile="paper",
+        preset="published",
         varied=({"schedule": "cosine"}, {"schedule": "constant"}),
         why="rates",
         common=(("hidden_layers", 1), ("width", 8)),
     ),
-    Axis(name="effort", profile="compact", varied=({"effort": 1}, {"effort": 2}), why="trials"),
+    Axis(name="effort", preset="default", varied=({"effort": 1}, {"effort": 2}), why="trials"),
 )
 
 
@@ -109,7 +109,7 @@ def test_a_variation_that_cannot_be_encoded_is_told(
 ) -> None:
     frames = Axis(
         name="key-frames",
-        profile="paper",
+        preset="published",
         varied=({"key_frames": "0,1"}, {"key_frames": "0,7"}),
         why="steps",
     )
@@ -122,8 +122,8 @@ def test_a_variation_that_cannot_be_encoded_is_told(
 
 @pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.name)
 def test_the_reference_is_the_default(axis: Axis) -> None:
-    common = {"profile": axis.profile, **dict(axis.common)}
-    if axis.profile == "paper":  # without the default promise, as the bench has it
+    common = {"preset": axis.preset, **dict(axis.common)}
+    if axis.preset == "published":  # without the default promise, as the bench has it
         common["tables"] = "float16"
     usual = EncodeConfig.from_dict(common)
     reference = EncodeConfig.from_dict({**common, **axis.varied[axis.reference]})
@@ -137,7 +137,7 @@ def test_the_reference_is_the_default(axis: Axis) -> None:
 @pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.name)
 def test_all_settings_are_allowed_and_differ(axis: Axis) -> None:
     configs = [
-        EncodeConfig.from_dict({"profile": axis.profile, **dict(axis.common), **varied})
+        EncodeConfig.from_dict({"preset": axis.preset, **dict(axis.common), **varied})
         for varied in axis.varied
     ]
     assert len(set(configs)) == len(configs)
@@ -192,13 +192,13 @@ def blob(steps: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("steps", [1, 3])
-@pytest.mark.parametrize("profile", ["compact", "paper"])
+@pytest.mark.parametrize("preset", ["default", "published"])
 def test_points_lie_beside_the_coreset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, profile: str, steps: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, steps: int
 ) -> None:
     path = tmp_path / "run.fhz"
-    config = EncodeConfig(profile=profile, features=("interval:0.5:2",), dilation=0)
-    if profile == "paper":
+    config = EncodeConfig(preset=preset, features=("interval:0.5:2",), dilation=0)
+    if preset == "published":
         config = replace(config, epochs=1, width=8, tables="float16")
     encode(blob(steps), path, config)
     asked: list[dict[str, Any]] = []

@@ -32,7 +32,7 @@ def test_every_benchmark_is_named_in_the_help(fhash: Fhash) -> None:
     assert {"train", "rate", "render"} <= set(command.commands)
 
 
-RATE = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
+RATE = ["--preset", "published", "--epochs", "1", "--width", "4", "-q"]
 
 
 def test_bench_rate_prints_one_json_object(fhash: Fhash, data: Path) -> None:
@@ -49,7 +49,7 @@ def test_bench_rate_prints_one_json_object(fhash: Fhash, data: Path) -> None:
     asked = {(point["codec"], point["goal"], point["asked"]) for point in report["points"]}
     assert asked == {
         (codec, *goal)
-        for codec in ("SZ3", "Blosc", "fhash paper")
+        for codec in ("SZ3", "Blosc", "fhash published")
         for goal in (("psnr", 40.0), ("bound", 0.02))
     }
     assert [row["peer"] for row in report["best_peers"]] == ["SZ3", "SZ3"]
@@ -69,19 +69,19 @@ def test_bench_rate_prints_tables(fhash: Fhash, data: Path) -> None:
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
     assert lines[0].split("  ")[0] == "bytes"
-    assert lines[0].endswith("best / fhash paper")
+    assert lines[0].endswith("best / fhash published")
     assert [line.split("  ")[0] for line in lines[1:3]] == ["40 dB", "within 5 %"]
     assert any(line.startswith("speed") for line in lines)
     assert any(line.startswith("6 x 7 x 8 of a step") for line in lines)
     assert any("float32 2 x 6 x 7 x 8" in line for line in lines)
 
 
-def test_bench_rate_measures_size_alone_and_no_profile(fhash: Fhash, data: Path) -> None:
+def test_bench_rate_measures_size_alone_and_no_preset(fhash: Fhash, data: Path) -> None:
     result = fhash(
         "bench",
         "rate",
         data,
-        *["--target", "40", "--peer", "ZFP", "--profile", "none", "--no-speed", "-q", "--json"],
+        *["--target", "40", "--peer", "ZFP", "--preset", "none", "--no-speed", "-q", "--json"],
     )
     assert result.exit_code == 0
     report = json.loads(result.stdout)
@@ -95,7 +95,7 @@ def test_bench_rate_draws(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         "bench",
         "rate",
         data,
-        *["--target", "40", "--peer", "SZ3", "--profile", "none", "--no-speed", "-q", "--plot"],
+        *["--target", "40", "--peer", "SZ3", "--preset", "none", "--no-speed", "-q", "--plot"],
         picture,
     ]
     assert fhash(*words).exit_code == 0
@@ -111,16 +111,14 @@ def test_bench_rate_refuses_what_is_unknown(
     assert "'zip' is no peer; allowed: SZ3, SPERR" in refused(
         2, "bench", "rate", data, "--peer", "zip"
     )
-    assert "'tiny' is no profile; allowed: " in refused(
-        2, "bench", "rate", data, "--profile", "tiny"
-    )
+    assert "'tiny' is no preset; allowed: " in refused(2, "bench", "rate", data, "--preset", "tiny")
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     assert "fhash[bench]" in refused(2, "bench", "rate", data, "--target", "40")
 
 
 def test_bench_rate_prices_tiles_and_takes_generated_series(fhash: Fhash) -> None:
     words = ("bench", "rate", "generated:long", "--target", "35", "--peer", "none", "--effort", "1")
-    result = fhash(*words, "--profile", "compact", "--no-speed", "-q", "--json")
+    result = fhash(*words, "--preset", "default", "--no-speed", "-q", "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     (price,) = report["tiles"]
@@ -153,7 +151,7 @@ def test_an_unknown_kind_is_refused(refused: Refused) -> None:
 
 def test_bench_table_prints_a_table_and_goes_on(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     words = ["bench", "table", data, "--target", "40", "--bound", "0.05", "--peer", "SZ3"]
-    words += ["--effort", "1", "--access", "fast", "-o", tmp_path / "cells", "-q"]
+    words += ["--effort", "1", "--preset", "fast", "-o", tmp_path / "cells", "-q"]
     first = fhash(*words)
     assert (first.exit_code, first.stderr) == (0, "")
     header, *rows = first.stdout.split("\n\n")[0].splitlines()

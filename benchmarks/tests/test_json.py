@@ -30,7 +30,7 @@ def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_bench_rate() -> None:
     result = example(RateBench)
-    own = replace(result.points[0], codec="fhash compact")
+    own = replace(result.points[0], codec="fhash default")
     result = replace(result, points=(*result.points, own))
     check("bench rate", json.loads(json.dumps(result.to_dict())))
 

@@ -169,7 +169,7 @@ def test_both_ways_decode_the_same_key_frames(
     assert whole.all()
 
 
-CONFIG = EncodeConfig(profile="paper", tables="float16", width=4, hidden_layers=1)
+CONFIG = EncodeConfig(preset="published", tables="float16", width=4, hidden_layers=1)
 
 
 @pytest.fixture
@@ -335,7 +335,7 @@ def test_it_runs_without_zarr() -> None:
         "from fhash_bench.rate import generated as made\n"
         "from fhash_bench.train import bench_train\n"
         "made.MADE = {'front': made.Made('front', (2, 8, 16, 16), '', False)}\n"
-        "config = EncodeConfig(profile='paper', tables='float16', width=4, hidden_layers=1)\n"
+        "config = EncodeConfig(preset='published', tables='float16', width=4, hidden_layers=1)\n"
         "print(len(bench_train(None, config, engines=('slab',), seconds=0.02)['series']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

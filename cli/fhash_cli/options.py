@@ -194,8 +194,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Feature": ("feature", "dilation"),
     "Steps and region": ("time", "roi", "box", "lod"),
     "Values": ("outside", "fill"),
-    "Profile compact": ("profile", "effort", "train", "tile", "access", "without"),
-    "Profile paper": (
+    "Preset": ("preset", "effort", "train", "tile", "without"),
+    "Preset published": (
         "key-frames", "samples", "fold", "embedding-size", "hidden-layers", "width", "epochs",
         "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables", "engine",
         "engines",
@@ -239,7 +239,7 @@ ELSEWHERE = {
     ("diff", "min-psnr"): "Quality, gates",
     ("rate", "target"): "Comparison",
     ("rate", "bound"): "Comparison",
-    ("rate", "profile"): "Comparison",
+    ("rate", "preset"): "Comparison",
     ("train", "engines"): "Comparison",
 }
 """Groups of options that mean something else in one command, by command and option."""
@@ -603,17 +603,17 @@ series_options = option_group(
 """Options of commands that read data; the command gets them as `source`."""
 
 
-def config_options(*names: str, profile: str | None = None) -> Callable[[Command], Command]:
+def config_options(*names: str, preset: str | None = None) -> Callable[[Command], Command]:
     """Add an option for each field of EncodeConfig, or for each of `names`.
 
     Help, choices and range of an option are those of the field. The command gets an EncodeConfig as
     `config`.
 
-    profile: the profile of a command that has no option for it.
+    preset: that of a command that has no option for it.
     """
     from fhash_codec.config import EncodeConfig
 
-    fixed = {} if profile is None else {"profile": profile}
+    fixed = {} if preset is None else {"preset": preset}
 
     def decorate(command: Command) -> Command:
         @functools.wraps(command)
@@ -628,7 +628,7 @@ def config_options(*names: str, profile: str | None = None) -> Callable[[Command
 def setting_options(*names: str, by_variable: bool = False) -> Callable[[Command], Command]:
     """Add options as `config_options` does; the command gets a dict of them as `settings`.
 
-    It serves commands whose settings are for several profiles.
+    It serves commands whose settings are for several presets.
 
     by_variable: whether a promise may be given for each variable, as a dict of numbers by name.
     """

@@ -377,6 +377,11 @@ def split_row(report: Mapping[str, Any]) -> tuple[str, str]:
     return "split", ", ".join(parts)
 
 
+def model_name(*, published: bool) -> str:
+    """The model of a file, for people."""
+    return "F-Hash, the published network" if published else "F-Hash"
+
+
 def _smaller(ratio: float) -> str:
     return f"{factor(ratio)} smaller" if ratio >= 1 else f"{factor(1 / ratio)} larger"
 

@@ -465,8 +465,8 @@ def _settings(container: Container, header: Mapping[str, Any]) -> TileSettings:
     """The settings that all tiles share; raises InputError for a file that cannot grow."""
     path, model = container.path, header["model"]
     if model["profile"] != COMPACT or PLAIN_FEATURE in header["required_features"]:
-        kind = "plain" if PLAIN_FEATURE in header["required_features"] else model["profile"]
-        raise InputError(f"{path} is a {kind} file; only files of the profile compact can grow")
+        kind = "a plain file" if model["profile"] == COMPACT else "the published network"
+        raise InputError(f"{path} is {kind}, which cannot grow")
     table = container.arrays.get(TABLE)
     settings = None if table is None else table.settings
     if table is None or not isinstance(settings, TileSettings):

@@ -382,10 +382,10 @@ def bounded(config: EncodeConfig) -> EncodeConfig:
 
     Raises InputError for a promise that no part alone can keep.
     """
-    if config.profile != "compact" or (config.max_error is None and config.max_error_rel is None):
+    if config.published or (config.max_error is None and config.max_error_rel is None):
         raise InputError(
-            "a part keeps a promise by itself, which is a bound of the error in the profile "
-            "compact: give max_error or max_error_rel"
+            "a part keeps a promise by itself, which is a bound of the error: give max_error or "
+            "max_error_rel, and not the preset published"
         )
     return replace(config, timings=False)
 

@@ -67,10 +67,10 @@ def bound_of(config: EncodeConfig, value_range: ValueRange | None) -> float:
 
     Raises InputError for settings that a file cannot keep whose later steps are not known yet.
     """
-    if config.profile != "compact":
+    if config.published:
         raise InputError(
-            f"profile '{config.profile}' needs all steps at once; a file that grows is of the "
-            "profile compact"
+            f"preset '{config.preset}' needs all steps at once; a file that grows is of another "
+            "preset"
         )
     if config.features != ("all",):
         raise InputError(

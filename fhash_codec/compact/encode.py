@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy.typing as npt
 
-from fhash_codec.compact.attempt import HeadHistory
 from fhash_codec.compact.goal import (
     EXCHANGE,
     FINEST_PSNR,

@@ -394,7 +394,7 @@ def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
     """
     bulk = figures["quality"]["bulk"]
     psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
-    plain = config.profile == "paper" and not config.coded
+    plain = config.published and not config.coded
     if config.psnr_bulk is None and not plain and None not in (psnr, psnr_bulk):
         enough = min(DEFAULT_PSNR_BULK, psnr - FAR_BELOW)
         if psnr_bulk < enough:
@@ -423,7 +423,7 @@ def decided_by_bulk(config: EncodeConfig, figures: Mapping[str, Any]) -> str | N
     """
     given = [name for name in PROMISES if getattr(config, name) is not None]
     psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
-    if config.profile != "compact" or None in (psnr, psnr_bulk):
+    if config.published or None in (psnr, psnr_bulk):
         return None
     if given not in ([], ["psnr", "psnr_bulk"]):
         return None

@@ -1,4 +1,4 @@
-"""Model of the profile compact, read from a file: values, tables, head, and plain arrays."""
+"""The default model, read from a file: values, tables, head, and plain arrays."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int)
     tiling = None
     if task.fixed_tile is None and config.effort > 1:
         tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
-        tell("plan", f"--access {config.access}: {tiling.describe()}")
+        tell("plan", f"--preset {config.preset}: {tiling.describe()}")
     coding = coding_of(
         config.effort,
         filled=density == 0,

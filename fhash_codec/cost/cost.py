@@ -94,9 +94,9 @@ def measure_cost(
 ) -> CostReport:
     """Measure what accuracy costs on a series.
 
-    The default settings and the network are always measured, of a crop where the series is large.
-    The most telling of the others come first; the result names what the time does not allow.
-    Ctrl-C ends the measurements, and what there is by then is returned.
+    The default settings and the published network are always measured, of a crop where the series
+    is large. The most telling of the others come first; the result names what the time does not
+    allow. Ctrl-C ends the measurements, and what there is by then is returned.
 
     Args:
         source: a file, a Series or an array.
@@ -177,9 +177,9 @@ def _measurable(
     extent = select_features(whole, config, progress).extent
     part = cropped(whole, PROBED_VERTICES, extent.box)
     share = select_features(part, config, silent).extent.samples / extent.samples
-    network = replace(config, profile="paper")
+    network = replace(config, preset="published")
     progress("predicting", 0, 1, "")
-    lattice = ADVICE_ENCODINGS * Predictor(part).predict(config).seconds / share
+    others = ADVICE_ENCODINGS * Predictor(part).predict(config).seconds / share
     probe = None
     with suppress(FhashError):  # told where the network is encoded
         probe = probe_paper(part, share, network)
@@ -187,7 +187,7 @@ def _measurable(
     kept = 1.0
     while kept * prod(whole.shape) > MIN_VERTICES:
         training = () if probe is None else probe.of_share(kept).stage_seconds(network).values()
-        if kept * lattice + sum(training) <= ADVICE_SHARE * budget:
+        if kept * others + sum(training) <= ADVICE_SHARE * budget:
             break
         kept *= 0.8
     return cropped(whole, math.ceil(kept * prod(whole.shape)), extent.box)
@@ -274,7 +274,7 @@ def report_on_encode(
         figures,
         Encoded(
             name=Path(figures["path"]).name,
-            codec=config.profile,
+            codec=config.preset,
             group="this encoding",
             options=options_of(config),
         ),

@@ -261,7 +261,7 @@ class Wish:
     """An encoding to be measured.
 
     Attributes:
-        codec: "compact", "paper" or a peer.
+        codec: the preset, or a peer.
         group: the curve that it belongs to.
         config: settings; None for a peer.
         target: PSNR in dB that a peer is set to.
@@ -281,7 +281,7 @@ class Wish:
             return f"{self.group}, error within {100 * self.config.max_error_rel:g} %"
         if self.config.psnr is not None:
             return f"{self.group}, {self.config.psnr:g} dB"
-        return NETWORK if self.codec == "paper" else DEFAULT
+        return NETWORK if self.config.published else DEFAULT
 
     @property
     def always(self) -> bool:
@@ -294,8 +294,6 @@ def options_of(config: EncodeConfig) -> str:
     words = []
     for option, value in options_beyond(vars(config), vars(EncodeConfig())):
         text = f"{value:.12g}" if isinstance(value, float) else f"{value}"
-        # The name that the options of the command line are listed with.
-        text = "network" if option == "--profile" else text
         words += [option] if value is None else [option, shlex.quote(text)]
     return " ".join(words)
 
@@ -305,15 +303,15 @@ def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
 
     def own(effort: int, psnr: float | None = None, error: float | None = None) -> Wish:
         config = EncodeConfig(features=features, effort=effort, psnr=psnr, max_error_rel=error)
-        return Wish(codec="compact", group=f"effort {effort}", config=config)
+        return Wish(codec=config.preset, group=f"effort {effort}", config=config)
 
     def peers(target: float) -> Iterator[Wish]:
         for name in PEERS:
             yield Wish(codec=name, group=name, target=target)
 
     yield own(5)
-    network = EncodeConfig(profile="paper", features=features)
-    yield Wish(codec="paper", group=NETWORK, config=network)
+    network = EncodeConfig(preset="published", features=features)
+    yield Wish(codec=network.preset, group=NETWORK, config=network)
     yield own(1, psnr=50.0)
     # A peer takes several times the time that is shown for it, since it is led to its target.
     yield from peers(50.0)

@@ -29,7 +29,7 @@ PART = 0.25
 WHOLE_SECONDS = 1.0
 """Predicted seconds up to which the whole series is encoded instead: nobody waits for these."""
 TRAINED_ON = 4 << 20
-"""Vertices of a series up to which the profile paper is probed on all of it."""
+"""Vertices of a series up to which the published network is probed on all of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class Predictor:
         with warnings.catch_warnings():
             # The encoding itself will say them.
             warnings.simplefilter("ignore", FhashWarning)
-            if config.profile == "paper":
+            if config.published:
                 return self._paper(config)
             if config not in self._encoded:
                 self._encoded[config] = self._compact(config)
@@ -126,7 +126,7 @@ def _steps(part: Series, series: Series) -> str:
 
 
 def _basis(part: Series, series: Series, seconds: float) -> str:
-    """The basis of a prediction for the profile compact, in words."""
+    """The basis of a prediction without the published network, in words."""
     uncertain = "seconds within a factor of 2, bytes within one of 1.7, more often too many"
     if part is series:
         uncertain = "bytes as they will be, seconds as far as the machine stays as it is"
@@ -216,7 +216,7 @@ def choose(
 ) -> Choice:
     """Choose the highest effort, or the most epochs, that a series should be encoded with in time.
 
-    config: the settings; the profile says which of the two is chosen.
+    config: the settings; the preset says which of the two is chosen.
     seconds: the time that probing and encoding may take together.
     capped: whether the effort or epochs of the settings are the most that may be chosen.
 
@@ -228,7 +228,7 @@ def choose(
         return seconds - (time.perf_counter() - begun)
 
     progress("predicting", 0, 1, "")
-    search = _most_epochs if config.profile == "paper" else _highest_effort
+    search = _most_epochs if config.published else _highest_effort
     chosen, prediction, beyond = search(Predictor(series), config, seconds, capped, left)
     progress("predicting", 1, 1, "")
     remaining = left()
@@ -292,7 +292,7 @@ def _most_epochs(
 
 def _option(config: EncodeConfig) -> str:
     """The option of a choice, as the command line takes it."""
-    if config.profile == "paper":
+    if config.published:
         return f"--epochs {config.epochs}"
     return f"--effort {config.effort}"
 

@@ -38,7 +38,7 @@ PLANNING = ("plan", "step", "labels", "head trial")
 CHOOSING = ("head", "predictor")
 """Stages that train on a sample, and code CODED_VERTICES at most."""
 FIXED_BYTES = ("model", "index")
-"""Parts of a compact file that hardly grow with the number of steps."""
+"""Parts of a file that hardly grow with the number of steps."""
 
 
 def windows_of(series: Series, vertices: int, share: float = 1.0) -> Series:
@@ -90,7 +90,7 @@ def promise_of_part(config: EncodeConfig, part: Series, series: Series) -> Encod
 
 @dataclass(frozen=True, kw_only=True)
 class CompactProbe:
-    """An encoding of a part of a series with the profile compact.
+    """An encoding of a part of a series with another preset than published.
 
     Attributes:
         vertices: of the part.
@@ -135,7 +135,7 @@ class CompactProbe:
 def probe_compact(part: Series, config: EncodeConfig) -> CompactProbe:
     """Encode a part of a series; raises InputError for settings that do not fit it."""
     with TemporaryDirectory() as folder:
-        report, _ = reported(part, Path(folder) / "part.fhz", replace(config, timings=True))
+        report = reported(part, Path(folder) / "part.fhz", replace(config, timings=True))
     fixed = sum(report["split"][name] for name in FIXED_BYTES)
     return CompactProbe(
         vertices=prod(part.shape),
@@ -212,7 +212,7 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     """
     config = replace(config, epochs=EPOCHS, psnr=None, psnr_bulk=None, timings=True)
     with TemporaryDirectory() as folder:
-        report, _ = reported(part, Path(folder) / "part.fhz", config)
+        report = reported(part, Path(folder) / "part.fhz", config)
     stages = {entry["stage"]: entry["seconds"] for entry in report["stages"]}
     training, curve = stages.pop("training", 0.0), stages.pop("curve", 0.0)
     keys = len(report["key_frames"])
@@ -231,11 +231,12 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     ).of_share(1 / share, config.batch)
 
 
-def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[EncodeReport, bool]:
-    """The report of an encoding, without warnings, and whether it keeps its promise."""
+def reported(part: Series, path: Path, config: EncodeConfig) -> EncodeReport:
+    """The report of an encoding, without warnings, also where it misses its promise."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FhashWarning)
         try:
-            return encode(part, path, config), True
+            return encode(part, path, config)
         except QualityError as error:
-            return error.figures, False
+            figures: EncodeReport = error.figures
+            return figures

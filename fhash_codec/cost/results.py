@@ -8,15 +8,16 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from fhash_codec.config import PRESETS
 from fhash_codec.file_info import HistoryPoint
 from fhash_codec.measure.errors import StepErrors
 
-OWN = ("compact", "paper")
-"""Codecs of this package; the others are peers."""
+OWN = PRESETS
+"""Codecs of this package, by their presets; the others are peers."""
 DEFAULT = "default settings"
 """Name of the encoding that `fhash encode` makes without options."""
-NETWORK = "network"
-"""Name of the encoding with `--profile network` alone, and of its curve."""
+NETWORK = "published network"
+"""Name of the encoding with `--preset published` alone, and of its curve."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,7 @@ class Encoded:
 
     Attributes:
         name: the encoding in words, such as "effort 5, 60 dB".
-        codec: "compact", "paper" or the name of a peer.
+        codec: the preset, or the name of a peer.
         group: the curve that the point belongs to, such as "effort 5".
         options: options of `fhash encode` that give it again; empty for a peer.
         seconds: of the whole encoding; None where it was predicted only.
@@ -100,7 +101,7 @@ class Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class Gain:
-    """The size of a compact file after a part of the search, estimated but for the last.
+    """The size of a file after a part of the search, estimated but for the last.
 
     Attributes:
         what: the part. bytes: the size.
@@ -384,7 +385,7 @@ def conclusion(report: CostReport) -> str:
     if peer is not None:
         parts.append(f"the smallest peer, {peer.codec}: {told(peer)}")
     if network is not None:
-        parts.append(f"the network: {told(network)}")
+        parts.append(f"the published network: {told(network)}")
     return "; ".join(parts) + "."
 
 

@@ -391,7 +391,9 @@ class PictureCosts:
                 ("ARM on", "arm"),
             )
         }
-        self._group(f"march, paper, {side} px", scenes, best="cache", renderer=renderer, turns=1)
+        self._group(
+            f"march, {NETWORK}, {side} px", scenes, best="cache", renderer=renderer, turns=1
+        )
 
     def _first_pictures(self) -> None:
         """Compare first pictures of a step by level of detail: nothing is decoded yet."""

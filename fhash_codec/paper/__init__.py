@@ -1,4 +1,4 @@
-"""The paper profile: the published F-Hash, trained from a random start.
+"""The published network of F-Hash, trained from a random start.
 
 network, storage and model: reading; fit and train: the training; tables and table_step: coded
 tables; engines: implementations of a training step.

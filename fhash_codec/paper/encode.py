@@ -1,4 +1,4 @@
-"""Encoding in the profile paper: selection, training, tables."""
+"""Encoding of the published network: selection, training, tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from fhash_codec.paper.network import Architecture, parameter_count
 from fhash_codec.paper.storage import load_network, write_model, write_tables
 from fhash_codec.progress import Progress, stage
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.header import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
+from fhash_formats.container.header import CORESET, FRINGE, PAPER, SPARSE, SPARSE_FEATURE
 from fhash_formats.series import Series
 
 
@@ -301,7 +301,7 @@ def _advice(
     if config.psnr is not None and held_psnr(None, rounding) < config.psnr:
         return (
             f"No network of these numbers has more than {held_psnr(None, rounding):.1f} dB in "
-            "every reader, since float32 rounds otherwise in each: leave --profile out"
+            "every reader, since float32 rounds otherwise in each: leave --preset out"
         )
     if trained.limited:
         return (
@@ -354,7 +354,7 @@ def _header(
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": coreset.fraction,
         "model": {
-            "profile": config.profile,
+            "profile": PAPER,
             "fold": config.model_fold,
             "embedding_size": architecture.embedding_size,
             "hidden_layers": architecture.hidden_layers,

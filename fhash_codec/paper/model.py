@@ -676,7 +676,7 @@ class PaperModel:
     def read_lod(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Raise InputError: the embeddings of a coarser level alone give no values."""
         raise InputError(
-            f"{self._container.path}: a file of the profile paper has no levels of detail; "
+            f"{self._container.path}: the published network has no levels of detail; "
             "decode it whole"
         )
 

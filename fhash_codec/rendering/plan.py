@@ -491,12 +491,11 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
             volume.lod_vertices(lod)  # raises for a level that the volume does not have
         if lod > 0 and volume.profile != "compact":
             raise InputError(
-                f"{volume.path}: a file of the profile {volume.profile} has no levels of detail; "
-                "leave 'lod' out"
+                f"{volume.path}: the published network has no levels of detail; leave 'lod' out"
             )
         return lod, "as the scene says"
     if volume.profile != "compact":
-        return 0, f"files of the profile {volume.profile} have but one"
+        return 0, "the published network has but one"
     across = pixel_vertices(rays)
     by_pixel = math.floor(math.log2(across)) if across >= 2 else 0
     by_box = min(
@@ -636,8 +635,8 @@ def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
         if march.mode in ("arm", "stream") or march.device == "cuda":
             what = "device 'cuda'" if march.device == "cuda" else f"march '{march.mode}'"
             raise InputError(
-                f"{what} is for a network, and {volume.path}, of the profile {volume.profile}, has "
-                "none: its decoded frames are marched on the CPU; leave it out"
+                f"{what} is for the published network, and {volume.path} holds another model: its "
+                "decoded frames are marched on the CPU; leave it out"
             )
         return "cache", "" if march.mode == "cache" else "since the file has no network"
     if march.mode == "auto":

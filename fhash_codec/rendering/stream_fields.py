@@ -225,7 +225,7 @@ class CoresetField:
 
 
 class NetworkField(CoresetField):
-    """The network of a file of the profile paper, evaluated at every place.
+    """The published network of a file, evaluated at every place.
 
     Between vertices it has values of its own.
     """

@@ -63,8 +63,8 @@ def key_times(run: Run) -> Iterator[Finding]:
 
 
 def between(run: Run) -> Iterator[Finding]:
-    """Values between two steps are finite in the coreset; in profile compact they are interpolated
-    linearly."""
+    """Values between two steps are finite in the coreset; without the published network they are
+    interpolated linearly."""
     last = run.volume.shape[0] - 1
     if last == 0:
         return
@@ -198,9 +198,7 @@ def quality(run: Run) -> Iterator[Finding]:
     ones."""
     where = np.isfinite(run.decoded)
     reached = _psnr(run, where)
-    promised = (
-        promise(run.config).get("psnr") if run.config.profile == "compact" else run.config.psnr
-    )
+    promised = run.config.psnr if run.config.published else promise(run.config).get("psnr")
     if promised is not None and reached > 0:
         yield Finding("promised PSNR", promised / reached, 1.0, "of the dB reached")
     stated = run.volume.container.header["quality"]
@@ -408,13 +406,13 @@ THREADS = (1, 2)
 
 
 def same_bytes(run: Run) -> Iterator[Finding]:
-    """The same input gives the same bytes; in profile compact with any number of threads, too.
+    """The same input gives the same bytes; with any number of threads but of the network.
 
     The long set compares all of `THREADS`, the quick set one of them in turn.
     """
     written = run.path.read_bytes()
     again = run.folder / "again.fhz"
-    if run.config.profile == "paper":
+    if run.config.published:
         encode(run.series, again, run.config, force=True)
         yield Finding("same bytes again", _count_unequal_bytes(written, again), 0.0, "bytes")
         return

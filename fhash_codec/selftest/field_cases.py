@@ -88,20 +88,22 @@ COMPACT: Settings = {
     "psnr": EncodeConfig(psnr=50.0, effort=1),
 }
 EXACT: Settings = {"exact": EncodeConfig(max_error=0.0, effort=1)}
-PAPER: Settings = {"paper": EncodeConfig(profile="paper", tables="float16", width=8, epochs=5)}
-QUICK: Settings = {**COMPACT, **PAPER}
+PUBLISHED: Settings = {
+    "published": EncodeConfig(preset="published", tables="float16", width=8, epochs=5)
+}
+QUICK: Settings = {**COMPACT, **PUBLISHED}
 MORE: Settings = {
     **EXACT,
     "head": EncodeConfig(psnr=60.0, effort=5),
     "bound-tight": EncodeConfig(max_error_rel=1e-6, effort=4),
     "tiles": EncodeConfig(max_error_rel=1e-2, effort=1, tile="2x3x4x5"),
-    "paper-float32": EncodeConfig(
-        profile="paper", width=16, hidden_layers=2, epochs=20, tables="float32"
+    "published-float32": EncodeConfig(
+        preset="published", width=16, hidden_layers=2, epochs=20, tables="float32"
     ),
-    "paper-uint8": EncodeConfig(
-        profile="paper", width=4, embedding_size=1, epochs=20, tables="uint8"
+    "published-uint8": EncodeConfig(
+        preset="published", width=4, embedding_size=1, epochs=20, tables="uint8"
     ),
-    "paper-transform": EncodeConfig(profile="paper", width=8, epochs=20, tables="transform"),
+    "published-transform": EncodeConfig(preset="published", width=8, epochs=20, tables="transform"),
 }
 """Additional settings of the long set."""
 
@@ -112,11 +114,11 @@ def of_all(settings: Settings, **changes: Any) -> dict[str, EncodeConfig]:
 
 
 ONE_KEY_FRAME: Settings = {
-    "paper-first": EncodeConfig(
-        profile="paper", tables="float16", width=8, epochs=5, key_frames="0"
+    "published-first": EncodeConfig(
+        preset="published", tables="float16", width=8, epochs=5, key_frames="0"
     ),
-    "paper-middle": EncodeConfig(
-        profile="paper", tables="float16", width=8, epochs=5, key_frames="2"
+    "published-middle": EncodeConfig(
+        preset="published", tables="float16", width=8, epochs=5, key_frames="2"
     ),
 }
 ONE_KEY_FRAME_CODED: Settings = {
@@ -231,15 +233,15 @@ STEPS = 6
 """Steps of the series."""
 SETTINGS: Settings = {
     "bound": COMPACT["bound"],
-    **PAPER,
-    "paper-keys": EncodeConfig(
-        profile="paper", tables="float16", width=8, epochs=5, key_frames="0,2,5"
+    **PUBLISHED,
+    "published-keys": EncodeConfig(
+        preset="published", tables="float16", width=8, epochs=5, key_frames="0,2,5"
     ),
 }
 ENDS: Settings = {
     **SETTINGS,
-    "paper-ends": EncodeConfig(
-        profile="paper", tables="float16", width=8, epochs=5, key_frames="0,5"
+    "published-ends": EncodeConfig(
+        preset="published", tables="float16", width=8, epochs=5, key_frames="0,5"
     ),
 }
 EVEN = np.arange(float(STEPS))
@@ -313,7 +315,7 @@ TIME_CASES: tuple[Case, ...] = (
         "one-time",
         "a single step at a time that is not 0",
         np.array([1e5])[:1],
-        {"bound": COMPACT["bound"], **PAPER},
+        {"bound": COMPACT["bound"], **PUBLISHED},
     ),
 )
 
@@ -370,7 +372,7 @@ def _with_holes() -> Values:
     return values
 
 
-KEYS = EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,2,3", tables="transform")
+KEYS = EncodeConfig(preset="published", width=8, epochs=5, key_frames="0,2,3", tables="transform")
 
 FEATURE_CASES: tuple[Case, ...] = (
     _feature_case(
@@ -393,7 +395,7 @@ FEATURE_CASES: tuple[Case, ...] = (
         "empty-key-frames",
         "a feature that is empty in some key frames",
         _lifted(lambda t, z, y, x: (t == 2) & (x > 3)),
-        settings={**QUICK, "paper-keys": KEYS},
+        settings={**QUICK, "published-keys": KEYS},
     ),
     _feature_case(
         "one-key-frame-filled",

@@ -383,7 +383,7 @@ def _apart(run: Run, name: str, config: EncodeConfig, limit: float) -> Finding:
 
 
 SHAPE = (3, 6, 7, 8)
-PLAIN = EncodeConfig(profile="paper", tables="float16", width=8, epochs=60, device="cpu")
+PLAIN = EncodeConfig(preset="published", tables="float16", width=8, epochs=60, device="cpu")
 EXACT = replace(PLAIN, tables="float32", epochs=30)
 
 

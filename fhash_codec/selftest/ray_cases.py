@@ -333,7 +333,9 @@ def _everything(run: Run) -> Any:
 SHAPE: Shape = (2, 7, 6, 5)
 BOUND: Settings = {"bound": EncodeConfig(max_error_rel=1e-3, effort=1)}
 EXACT: Settings = {"exact": EncodeConfig(max_error=0.0, effort=1)}
-NETWORK: Settings = {"paper": EncodeConfig(profile="paper", tables="float16", width=8, epochs=30)}
+NETWORK: Settings = {
+    "published": EncodeConfig(preset="published", tables="float16", width=8, epochs=30)
+}
 FOG: Any = {"opacity": [[0.0, 0.02], [1.0, 0.5]]}
 AXES = ("xy", "yx", "xz", "zx", "yz", "zy")
 FRONT = {"view": "xy", "projection": "parallel"}

@@ -17,7 +17,7 @@ from fhash_codec.selftest.field_cases import (
     COMPACT,
     EXACT,
     MORE,
-    PAPER,
+    PUBLISHED,
     QUICK,
     SHAPE,
     Settings,
@@ -166,9 +166,9 @@ def _declared_values(run: Run) -> Iterator[Finding]:
 
 DEFAULT: Settings = {"default": EncodeConfig()}
 LOSSLESS: Settings = {**COMPACT, **EXACT}
-COUNTED: Settings = {**LOSSLESS, "one": EncodeConfig(max_error=1.0, effort=2), **PAPER}
-WIDE: Settings = {"wide": EncodeConfig(max_error=512.0, effort=2), **PAPER}
-OF_64_BITS: Settings = {**COMPACT, "wide": EncodeConfig(max_error=1024.0, effort=2), **PAPER}
+COUNTED: Settings = {**LOSSLESS, "one": EncodeConfig(max_error=1.0, effort=2), **PUBLISHED}
+WIDE: Settings = {"wide": EncodeConfig(max_error=512.0, effort=2), **PUBLISHED}
+OF_64_BITS: Settings = {**COMPACT, "wide": EncodeConfig(max_error=1024.0, effort=2), **PUBLISHED}
 """Settings for 64-bit integers. Volumes return them as float64, so the bound covers the rounding to
 float64."""
 
@@ -204,7 +204,7 @@ VALUE_CASES: tuple[Case, ...] = (
         "constant-uint64-beyond",
         "the largest 64-bit integer, which float64 cannot represent",
         lambda: np.full(SHAPE, 2**64 - 1, dtype=np.uint64),
-        {**PAPER, **WIDE},
+        {**PUBLISHED, **WIDE},
         more={},
     ),
     _case(
@@ -420,7 +420,7 @@ def guises(run: Run) -> Iterator[Finding]:
     same size."""
     seeds = (
         [_quality(run.values, _encoded(run, run.values, 1.0, seed=seed)[0]) for seed in SEEDS]
-        if run.config.profile == "paper"
+        if run.config.published
         else []
     )
     for under, values in _guises(run.values):
@@ -460,7 +460,7 @@ def _alike(run: Run, values: Values, other: Values, size: int, under: str) -> It
     yield Finding("same PSNR in any guise", apart, MAX_PSNR_DIFFERENCE, "dB", under)
     allowed = (
         MAX_SIZE_DIFFERENCE_BY_TRIAL
-        if run.config.effort >= 2 and run.config.profile == "compact"
+        if run.config.effort >= 2 and not run.config.published
         else MAX_SIZE_DIFFERENCE
     )
     yield Finding(
@@ -505,7 +505,9 @@ _make = single(lambda: waves(GUISE_SHAPE) + 0.02 * noise(GUISE_SHAPE))
 
 GUISE_QUICK: Settings = {
     "bound": EncodeConfig(max_error_rel=1e-2, effort=1),
-    "paper": EncodeConfig(profile="paper", tables="float16", width=16, epochs=30, device="cpu"),
+    "published": EncodeConfig(
+        preset="published", tables="float16", width=16, epochs=30, device="cpu"
+    ),
 }
 GUISE_MORE: Settings = {
     "absolute": EncodeConfig(max_error=1e-2, effort=1),

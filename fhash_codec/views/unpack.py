@@ -166,7 +166,7 @@ def _require_plain_tiles(volume: Volume) -> None:
     """Raise InputError for a volume whose values are more than what its tiles decode to."""
     header = volume.container.header
     if header["model"]["profile"] != COMPACT:
-        raise InputError(_refusal(volume, f"a model of the profile {volume.profile}"))
+        raise InputError(_refusal(volume, "the published network"))
     if PLAIN_FEATURE in header["required_features"]:
         raise InputError(_refusal(volume, "tables of plain numbers"))
     table: StoredArray = volume.container.arrays[TABLE]

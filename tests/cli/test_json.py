@@ -41,7 +41,7 @@ def test_every_command_has_a_schema() -> None:
         ("EncodeConfig", EncodeConfig, EncodeConfig().to_dict(), True),
         ("EncodeConfig", EncodeConfig, {"effort": 9, "psnr": None}, True),
         ("EncodeConfig", EncodeConfig, {"effort": 10}, False),
-        ("EncodeConfig", EncodeConfig, {"profile": "small"}, False),
+        ("EncodeConfig", EncodeConfig, {"preset": "compact"}, False),
         ("render --scene", Scene, {"effects": {"shading": True, "clip": {"x": [False, 2]}}}, True),
         ("render --scene", Scene, {"effects": {"shading": False}, "time": 1}, True),
         ("render --scene", Scene, {"effects": {"isosurfaces": [{"opacity": 1}]}}, False),
@@ -82,7 +82,15 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     for settings in (
         ["--effort", "2"],
         ["--effort", "2", "--no-timings", "--missing", repr(float(smallest))],
-        *(["--profile=paper", "--tables=float16", "--epochs=1", "--width=4", "--key-frames=0,2"],),
+        *(
+            [
+                "--preset=published",
+                "--tables=float16",
+                "--epochs=1",
+                "--width=4",
+                "--key-frames=0,2",
+            ],
+        ),
     ):
         words = ["encode", data, "-o", path, "--force", *settings]
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
@@ -106,10 +114,8 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
     words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]
     outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
-    words[-4:] = ["--profile", "auto", "--psnr", "20"]
+    words[-4:] = ["--preset", "published", "--psnr", "20"]
     outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
-    words[words.index("auto")] = "network"
-    fhash(*words, "-q")
     outputs["info"].append(parsed(fhash("info", path, "--json")))
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     with h5py.File(partly, "w") as file, h5py.File(data) as whole:

@@ -182,7 +182,7 @@ def test_a_signal_leaves_nothing_half_written(
             data,
             "-o",
             tmp_path / "out.fhz",
-            *["--profile", "paper", "--tables", "uint8", "--epochs", "1", "--width", "4"],
+            *["--preset", "published", "--tables", "uint8", "--epochs", "1", "--width", "4"],
         ],
         "decode": ["decode", run, "-o", tmp_path / "out.npy"],
     }[command]

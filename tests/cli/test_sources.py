@@ -30,7 +30,7 @@ from fhash_formats.errors import FhashWarning
 from fhash_formats.readers.registry import open_series
 
 SMALL = ["--effort", "1", "--quiet"]
-PAPER = ["--profile=paper", "--tables=float16", "--epochs", "1", "--width", "4", "--quiet"]
+PAPER = ["--preset=published", "--tables=float16", "--epochs", "1", "--width", "4", "--quiet"]
 
 
 @pytest.fixture
@@ -114,10 +114,10 @@ SETTINGS = [
     (["--feature", "blob"], "blob"),
     (["--feature", ""], "feature"),
     (["--feature", "mask:missing.npy"], "missing.npy"),
-    (["--profile", "paper", "--key-frames", "every:0"], "every"),
-    (["--profile", "paper", "--key-frames", "5,9"], "9"),
-    (["--profile", "paper", "--key-frames", ""], "key"),
-    (["--key-frames", "0,1"], "key-frames belongs to --profile paper; the profile is compact"),
+    (["--preset", "published", "--key-frames", "every:0"], "every"),
+    (["--preset", "published", "--key-frames", "5,9"], "9"),
+    (["--preset", "published", "--key-frames", ""], "key"),
+    (["--key-frames", "0,1"], "key-frames belongs to --preset published; the preset is default"),
     (["--ratio", "40", "--max-error", "0.1"], "max-error and ratio are given; promise one of them"),
     (["--ratio", "1e6"], "the ratio is out of reach: it leaves 0 bytes for the file"),
     (["--max-error", "-1"], "--max-error"),
@@ -125,7 +125,7 @@ SETTINGS = [
     (["--tile", "0x4x4x4"], "4x32x32x32"),
     (["--width", "many"], "--width"),
     (["--learning-rate", "nan"], "learning-rate"),
-    (["--profile", "huge"], "--profile"),
+    (["--preset", "huge"], "--preset"),
     (["--t", "a"], "half-open range"),
     (["--endian", "middle"], "--endian"),
     (["--unknown"], "--unknown"),

@@ -45,7 +45,7 @@ def encoded(tmp_path_factory: pytest.TempPathFactory) -> tuple[npt.NDArray[np.ge
     values = waves((5, 9, 12, 20))
     path = tmp_path_factory.mktemp("encoded") / "waves.fhz"
     config = EncodeConfig(
-        profile="paper",
+        preset="published",
         tables="float16",
         features=("interval:0.5:2",),
         key_frames="0,2,4",

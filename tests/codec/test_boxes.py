@@ -72,7 +72,7 @@ def waves(dtype: str) -> np.ndarray:
     return values.astype(dtype)
 
 
-NETWORK = {"profile": "paper", "tables": "float16", "epochs": 2}
+NETWORK = {"preset": "published", "tables": "float16", "epochs": 2}
 CASES = {
     "floats with holes": ("f4", {}),
     "a feature": ("f4", {"features": ("interval:0:60",)}),

@@ -297,13 +297,13 @@ REGIONS = [
 SETTINGS = {
     "compact": {"effort": 1, "tile": "2x3x4x4"},
     "paper": {
-        "profile": "paper",
+        "preset": "published",
         "tables": "float16",
         "epochs": 2,
         "width": 8,
         "key_frames": "0,1,3",
     },
-    "coded": {"profile": "paper", "epochs": 2, "width": 8, "tables": "transform"},
+    "coded": {"preset": "published", "epochs": 2, "width": 8, "tables": "transform"},
 }
 
 
@@ -322,7 +322,7 @@ def named_model(request, tmp_path_factory):
         yield request.param, open_model(container)
 
 
-def test_each_profile_has_its_model(named_model) -> None:
+def test_each_preset_has_its_model(named_model) -> None:
     name, model = named_model
     assert isinstance(model, CompactModel if name == "compact" else PaperModel)
     assert tuple(model.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
@@ -407,7 +407,7 @@ def test_layers_beyond_the_cache_are_decoded_together(
 def test_the_figures_are_those_of_the_file(field, tmp_path) -> None:
     source = field()
     config = EncodeConfig(
-        profile="paper", tables="float16", features=("interval:50:200",), epochs=8, width=16
+        preset="published", tables="float16", features=("interval:50:200",), epochs=8, width=16
     )
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:

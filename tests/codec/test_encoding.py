@@ -100,9 +100,9 @@ def test_arrays_in_memory_and_datasets_of_xarray(tmp_path: Path) -> None:
         assert [(name, volume.name) for name, volume in dataset.items()] == [("b", "b"), ("a", "a")]
 
 
-def test_profiles_mix(tmp_path: Path) -> None:
+def test_presets_mix(tmp_path: Path) -> None:
     path, arrays = tmp_path / "run.fhz", {"a": values(0), "b": values(1)}
-    paper = EncodeConfig(profile="paper", tables="float16", epochs=2, width=4, timings=False)
+    paper = EncodeConfig(preset="published", tables="float16", epochs=2, width=4, timings=False)
     fhash_codec.encode_dataset(arrays, path, {"a": paper, "b": QUICK})
     fhash_codec.encode(arrays["a"], tmp_path / "a.fhz", paper)
     with opened(path) as dataset, fhash_codec.open(tmp_path / "a.fhz") as alone:
@@ -153,7 +153,7 @@ def test_an_older_file_is_not_replaced(tmp_path: Path) -> None:
     assert path.read_bytes() == b"older"
 
 
-QUICK_ENCODING = EncodeConfig(profile="paper", tables="float16", epochs=6, width=16)
+QUICK_ENCODING = EncodeConfig(preset="published", tables="float16", epochs=6, width=16)
 FAST = EncodeConfig(effort=1)
 BOTH = pytest.mark.parametrize("config", [QUICK_ENCODING, FAST], ids=["paper", "compact"])
 
@@ -185,7 +185,7 @@ def test_every_number_type_comes_back(field, tmp_path, dtype, config) -> None:
     source = ((field() + 110) * 0.7).astype(dtype)
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     back = decoded(tmp_path / "a.fhz")
-    whole = np.dtype(dtype).kind in "iu" and config.profile == "compact"
+    whole = np.dtype(dtype).kind in "iu" and not config.published
     assert back.dtype.kind == (np.dtype(dtype).kind if whole else "f")
     assert figures["psnr"] > 20
     error = np.abs(back.astype(np.float64) - source.astype(np.float64))
@@ -224,7 +224,7 @@ def test_missing_values_stay_out_of_range_coreset_and_figures(field, tmp_path) -
     holes[1] = True
     source[holes] = np.random.default_rng(1).choice([np.nan, np.inf, -np.inf], holes.sum())
     for settings in ({}, {"key_frames": "0,3"}, {"features": ("interval:50:300",)}):
-        config = EncodeConfig(profile="paper", tables="float16", epochs=30, width=16, **settings)
+        config = EncodeConfig(preset="published", tables="float16", epochs=30, width=16, **settings)
         figures = fhash_codec.encode(source, tmp_path / "a.fhz", config, force=True)
         assert np.isfinite(figures["rmse"])
         assert figures["psnr"] > 15
@@ -267,7 +267,10 @@ def test_an_output_that_is_there_is_kept(field, tmp_path, config) -> None:
 
 @pytest.mark.filterwarnings("ignore:training ends")
 def test_a_missed_promise_replaces_nothing(field, tmp_path) -> None:
-    path, config = tmp_path / "run.fhz", EncodeConfig(profile="paper", epochs=1, width=4, psnr=150)
+    path, config = (
+        tmp_path / "run.fhz",
+        EncodeConfig(preset="published", epochs=1, width=4, psnr=150),
+    )
     path.write_bytes(b"precious")
     for name in ("run.missed.fhz", "run.missed-2.fhz"):
         with pytest.raises(QualityError, match=f"the file is .*/{name}") as missed:
@@ -338,12 +341,12 @@ def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path) -> None:
     source = (2 * np.random.default_rng(0).random((2, 4, 5, 6)) - 1) * 1.7e308
     with pytest.raises(QualityError, match="an unknown PSNR"):
         fhash_codec.encode(
-            source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, psnr=300.0)
+            source, tmp_path / "a.fhz", EncodeConfig(preset="published", epochs=1, psnr=300.0)
         )
     figures = fhash_codec.encode(
         np.zeros((2, 4, 5, 6)),
         tmp_path / "b.fhz",
-        EncodeConfig(profile="paper", epochs=1, psnr=300.0),
+        EncodeConfig(preset="published", epochs=1, psnr=300.0),
     )
     assert figures["rmse"] == 0
 

@@ -73,7 +73,7 @@ def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
 
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
-PAPER = EncodeConfig(profile="paper", tables="float16", epochs=1, width=8, timings=False)
+PAPER = EncodeConfig(preset="published", tables="float16", epochs=1, width=8, timings=False)
 
 
 def plain_file(path: Path) -> Path:
@@ -102,7 +102,7 @@ def test_plain_coordinates_cost_at_most_300_bytes(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("config", [QUICK, PAPER], ids=["compact", "paper"])
-def test_both_profiles_and_plain_files_keep_everything(tmp_path, config) -> None:
+def test_both_models_and_plain_files_keep_everything(tmp_path, config) -> None:
     kind = KINDS["rotated"]()
     # too many numbers for the header
     long = np.arange(400.0)

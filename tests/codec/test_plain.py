@@ -125,7 +125,7 @@ def test_kinds_of_data_and_promises(case: str, tmp_path: Path) -> None:
 
 def test_coded_masks_and_weights_of_the_paper_come_back(tmp_path: Path) -> None:
     config = EncodeConfig(
-        profile="paper", epochs=1, width=32, tables="transform", features=("interval:0:70",)
+        preset="published", epochs=1, width=32, tables="transform", features=("interval:0:70",)
     )
     fhash_codec.encode(moving("float32"), tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:

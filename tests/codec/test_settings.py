@@ -50,7 +50,9 @@ from fhash_formats.support.threads import usable_threads
         EncodeConfig(
             features=("interval:0:1", "isosurface:3"), max_error=0.5, effort=3, tile="4x8x8x8"
         ),
-        EncodeConfig(profile="paper", key_frames="0,4,9", psnr=45.0, epochs=0, learning_rate=1e-3),
+        EncodeConfig(
+            preset="published", key_frames="0,4,9", psnr=45.0, epochs=0, learning_rate=1e-3
+        ),
     ],
     ids=["default", "changed", "paper"],
 )
@@ -69,17 +71,23 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
     [
         ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native, slab"),
         (
-            {"profile": "paper", "ratio": 9.0},
-            "ratio belongs to --profile compact; the profile is paper",
+            {"preset": "published", "ratio": 9.0},
+            "ratio is not for --preset published",
         ),
-        ({"profile": "paper", "effort": 1}, "effort belongs to --profile compact"),
-        ({"profile": "network", "max_error": 1.0}, "max-error is not for --profile network"),
-        ({"profile": "paper", "max_error_rel": 0.1}, "max-error-rel is not .* leave --profile out"),
-        ({"profile": "paper", "epochs": 5, "train_on_seconds": 9}, "give one of them"),
-        ({"profile": "paper", "tile": "whole"}, "tile belongs to --profile compact"),
-        ({"key_frames": [0, 2]}, "key-frames belongs to --profile paper; the profile is compact"),
+        ({"preset": "published", "effort": 1}, "effort is not for --preset published"),
+        (
+            {"preset": "published", "max_error": 1.0},
+            "max-error is not for --preset published, whose",
+        ),
+        (
+            {"preset": "published", "max_error_rel": 0.1},
+            "max-error-rel is not .* leave --preset out",
+        ),
+        ({"preset": "published", "epochs": 5, "train_on_seconds": 9}, "give one of them"),
+        ({"preset": "published", "tile": "whole"}, "tile is not for --preset published"),
+        ({"key_frames": [0, 2]}, "key-frames belongs to --preset published; the preset is default"),
         *(
-            ({name: value}, f"{name.replace('_', '-')} belongs to --profile paper")
+            ({name: value}, f"{name.replace('_', '-')} belongs to --preset published")
             for name, value in {
                 "fold": 3,
                 "embedding_size": 1,
@@ -98,6 +106,9 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
             "psnr and max-error and ratio are given; promise one of them",
         ),
         ({"psnr_bulk": 40.0, "max_error": 1.0}, "psnr-bulk and max-error are given; promise one"),
+        ({"preset": "fast", "tile": "whole"}, "preset 'fast' and tile 'whole' are given"),
+        ({"preset": "compact"}, "preset is 'compact'; allowed: default, small, fast, published"),
+        ({"profile": "paper"}, "unknown setting 'profile'"),
         ({"psnr_bulk": 401.0}, "psnr-bulk is 401"),
         ({"effort": 2.5}, "effort is 2.5; a whole number"),
         ({"fold": 1}, "fold is 1; allowed: 2 to 64"),
@@ -110,8 +121,8 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
         ({"dilation": -1}, "dilation is -1"),
         ({"without": ("tile",)}, "without names 'tile'; did you mean 'tiles'"),
         (
-            {"profile": "paper", "without": "tiles"},
-            "without names 'tiles', a stage of --profile compact",
+            {"preset": "published", "without": "tiles"},
+            "without names 'tiles', which --preset published does not have; it has ssim",
         ),
     ],
 )
@@ -121,9 +132,26 @@ def test_a_value_that_is_not_allowed_is_named_with_what_is(values, message) -> N
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("preset", "access", "published"),
+    [
+        ("default", "balanced", False),
+        ("small", "small", False),
+        ("fast", "fast", False),
+        ("published", "balanced", True),
+    ],
+)
+def test_a_preset_says_what_reading_may_cost_and_which_model(
+    preset: str, access: str, published: bool
+) -> None:
+    config = EncodeConfig(preset=preset)
+    assert (config.access, config.published) == (access, published)
+    assert config.to_dict()["preset"] == preset
+
+
 def test_settings_may_be_given_as_python_values() -> None:
     assert EncodeConfig(features="all").features == ("all",)
-    assert EncodeConfig(profile="paper", key_frames=[0, 3]).key_frames == "0,3"
+    assert EncodeConfig(preset="published", key_frames=[0, 3]).key_frames == "0,3"
     with pytest.raises(InputError, match="mask="):
         EncodeConfig(features=(np.ones(3, bool),))
 

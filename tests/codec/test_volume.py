@@ -32,7 +32,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     """A file with plain tables, one with coded tables, and that one in plain numbers."""
     path = tmp_path_factory.mktemp("apart") / "two.fhz"
     config = EncodeConfig(
-        profile="paper",
+        preset="published",
         features=(LOW, HIGH),
         key_frames="0,2,3",
         epochs=2,
@@ -87,7 +87,7 @@ def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
     """The numbers of the mask have 8 bits; more features have bits."""
     features = tuple(f"interval:{n / 10:g}:{n / 10 + 0.05:g}" for n in range(count))
     config = EncodeConfig(
-        profile="paper", features=features, epochs=1, width=4, dilation=0, tables="transform"
+        preset="published", features=features, epochs=1, width=4, dilation=0, tables="transform"
     )
     path, plain = tmp_path / "many.fhz", tmp_path / "plain.fhz"
     fhash_codec.encode(ramp(), path, config)
@@ -267,17 +267,17 @@ def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume) -> No
         volume.read(0, outside="zero")
 
 
-@pytest.mark.parametrize("profile", ["paper", "compact"])
+@pytest.mark.parametrize("preset", ["published", "default"])
 @pytest.mark.parametrize("t", [0, 2.5, 4])
-def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t) -> None:
+def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, preset, t) -> None:
     field = np.arange(5 * 6 * 7 * 8, dtype=np.float32).reshape(5, 6, 7, 8) % 317
     field[2, 3:, 4] = np.nan
     plain = {"epochs": 1, "width": 4, "tables": "float16"}
-    short = plain if profile == "paper" else {"effort": 1, "tile": "2x3x4x5"}
+    short = plain if preset == "published" else {"effort": 1, "tile": "2x3x4x5"}
     fhash_codec.encode(
         field,
         tmp_path / "a.fhz",
-        EncodeConfig(profile=profile, features=("interval:100:150",), dilation=0, **short),
+        EncodeConfig(preset=preset, features=("interval:100:150",), dilation=0, **short),
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         occupied = volume.occupancy(t)
@@ -445,9 +445,9 @@ def test_levels_of_detail_ask_for_all_tiles_at_once(path, url, range_server) -> 
         assert_array_equal(volume.tables[1][0, :8, :8, :8, 0], here.tables[1][0, :8, :8, :8, 0])
 
 
-@pytest.mark.parametrize("profile", ["paper", "compact"])
-def test_both_profiles_equal_the_file_at_hand(encoded, path, range_server, profile) -> None:
-    path = encoded[1] if profile == "paper" else path
+@pytest.mark.parametrize("preset", ["published", "default"])
+def test_both_models_equal_the_file_at_hand(encoded, path, range_server, preset) -> None:
+    path = encoded[1] if preset == "published" else path
     url = range_server.put("run.fhz", path.read_bytes())
     with fhash_codec.open(path) as here, fhash_codec.open(url) as volume:
         assert range_server.taken()[0] <= 3

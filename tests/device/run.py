@@ -246,7 +246,9 @@ def coreset_of(series: Any, feature: str, dilation: int = 1) -> Any:
     from fhash_codec.paper.encode import select
     from fhash_codec.progress import silent
 
-    config = EncodeConfig(profile="paper", tables="float16", features=(feature,), dilation=dilation)
+    config = EncodeConfig(
+        preset="published", tables="float16", features=(feature,), dilation=dilation
+    )
     return select(series, config, silent).coreset
 
 
@@ -440,7 +442,7 @@ def card(run: Run) -> Iterator[Result]:
     from PIL import Image
 
     path, data = run.work / "front.fhz", run.data
-    options = ["--profile=paper", "--tables=float16", "--explain"]
+    options = ["--preset=published", "--tables=float16", "--explain"]
     words = ["encode", str(data), "-o", str(path), *options]
     encoded = fhash([*words, "--device", run.device, "--epochs", str(run.epochs)])
     trained = fhash(["info", str(path)])["training"]

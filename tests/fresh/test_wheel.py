@@ -123,7 +123,7 @@ def test_a_plain_install_encodes_decodes_renders_and_verifies(site: Path, tmp_pa
     ("arguments", "extra"),
     [
         (
-            ("encode", "run.npy", "-o", "paper.fhz", "--profile", "paper", "--device", "cuda"),
+            ("encode", "run.npy", "-o", "paper.fhz", "--preset", "published", "--device", "cuda"),
             "fhash[cuda]",
         ),
         (("bench", "rate", "run.npy"), "fhash[bench]"),

@@ -46,8 +46,8 @@ def basins() -> ArraySeries:
 
 
 def write_variables(path: Path) -> None:
-    """Winds on one grid, one with a promise of its own; a feature; labels; a variable of profile
-    paper; a name that is no name of an array."""
+    """Winds on one grid, one with a promise of its own; a feature; labels; a variable of the
+    published network; a name that is no name of an array."""
     staggered = Coordinate(name="x", values=np.arange(8) + 0.5, attributes={"units": "km"})
     rain = wave(2) * (wave(2) > 0.5)
     sources = {
@@ -58,7 +58,7 @@ def write_variables(path: Path) -> None:
         "tracer": ArraySeries(wave(3), name="tracer", coords=coordinates()),
     }
     small = EncodeConfig(
-        profile="paper", hidden_layers=0, embedding_size=1, fold=3, tables="uint8", timings=False
+        preset="published", hidden_layers=0, embedding_size=1, fold=3, tables="uint8", timings=False
     )
     configs = {
         "u": EASY,

@@ -27,10 +27,10 @@ HERE = Path(__file__).parent
 
 GOLDENS = {
     "paper-plain": EncodeConfig(
-        profile="paper", hidden_layers=1, width=8, timings=False, tables="float32"
+        preset="published", hidden_layers=1, width=8, timings=False, tables="float32"
     ),
     "paper-feature": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=1,
         width=8,
         timings=False,
@@ -39,7 +39,7 @@ GOLDENS = {
         tables="float16",
     ),
     "paper-linear-uint8": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=0,
         embedding_size=1,
         fold=3,
@@ -53,7 +53,7 @@ GOLDENS = {
     ),
     "compact-mask": EncodeConfig(psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)),
     "compact-predictor": EncodeConfig(
-        max_error=0.3, effort=7, timings=False, access="small", without=("head",)
+        max_error=0.3, effort=7, timings=False, preset="small", without=("head",)
     ),
     "compact-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
     "compact-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
@@ -68,14 +68,14 @@ GOLDENS = {
         max_error=0.0, effort=2, timings=False, features=("interval:700:9000",), dilation=0
     ),
     "compact-trellis": EncodeConfig(psnr=50.0, effort=2, timings=False),
-    "compact-fast": EncodeConfig(psnr=60.0, effort=2, timings=False, access="fast"),
+    "compact-fast": EncodeConfig(psnr=60.0, effort=2, timings=False, preset="fast"),
     "compact-fast-bound": EncodeConfig(
-        max_error=1e-4, effort=3, timings=False, access="fast", features=("interval:0.5:2",)
+        max_error=1e-4, effort=3, timings=False, preset="fast", features=("interval:0.5:2",)
     ),
     "compact-linear": EncodeConfig(max_error=8.0, effort=8, timings=False),
     "compact-signs": EncodeConfig(psnr=40.0, effort=2, timings=False),
     "paper-transform": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=1,
         width=8,
         timings=False,
@@ -84,7 +84,7 @@ GOLDENS = {
         psnr=60.0,
     ),
     "paper-coded-occupancy": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=1,
         width=32,
         embedding_size=4,
@@ -94,7 +94,7 @@ GOLDENS = {
         key_frames="0,2,4",
     ),
     "paper-features": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=1,
         width=4,
         timings=False,
@@ -104,7 +104,7 @@ GOLDENS = {
         key_frames="0,2,4",
     ),
     "paper-sparse": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=1,
         width=8,
         timings=False,
@@ -114,7 +114,7 @@ GOLDENS = {
         key_frames="0,2,3",
     ),
     "paper-sparse-untrained": EncodeConfig(
-        profile="paper",
+        preset="published",
         hidden_layers=0,
         embedding_size=1,
         fold=3,

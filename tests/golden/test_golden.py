@@ -12,6 +12,7 @@ from reference import rounding
 from zarr.storage import ZipStore
 
 import fhash_codec
+from fhash_codec.header import history_line
 from fhash_formats.container.reader import Container
 from fhash_formats.transform.tile_format import (
     DIFFERENCES,
@@ -117,6 +118,18 @@ def test_variables_files_that_grew_and_parts_decode_to_their_values(
         if volume.profile == "compact":
             np.testing.assert_array_equal(whole, expected[f"{start}whole"])
         np.testing.assert_allclose(whole, expected[f"{start}whole"], **same)
+
+
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [("paper-plain", "published"), ("compact-fast", "fast"), ("compact-psnr", "default")],
+)
+def test_settings_of_goldens_say_the_preset(name: str, preset: str) -> None:
+    with fhash_codec.open(HERE / f"{name}.fhz") as volume:
+        assert fhash_codec.EncodeConfig.from_dict(volume.config).preset == preset
+        assert (f" --preset {preset}" in history_line(volume.container.header)) == (
+            preset != "default"
+        )
 
 
 @pytest.mark.parametrize("name", SEVERAL)

@@ -125,8 +125,8 @@ class Server:
 COMPACT = ("--effort", "1", "--no-timings", "-q")
 BOUND = ("--max-error", "0.05", "--tile", "2x9x10x12", *COMPACT)
 PAPER = (
-    "--profile",
-    "paper",
+    "--preset",
+    "published",
     "--tables",
     "float16",
     "--epochs",
@@ -136,7 +136,7 @@ PAPER = (
     "--no-timings",
     "-q",
 )
-PROFILES = {"compact": COMPACT, "paper": PAPER}
+PRESETS = {"default": COMPACT, "published": PAPER}
 FORMATS = ("npy", "h5", "nc", "zarr", "raw", "vti", "vtr", "pvd", "vtkhdf")
 SHAPE = (4, 9, 10, 12)
 
@@ -271,7 +271,7 @@ GROWING = ("append",)
 COMMANDS = {
     **{
         f"encode {name}": ("encode", "{in}", "-o", "{out}/a.fhz", "--force", *words)
-        for name, words in PROFILES.items()
+        for name, words in PRESETS.items()
     },
     **{
         f"decode {suffix}": ("decode", "{run}", "-o", f"{{out}}/a.{suffix}", "--force", "-q")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faulty import COMMANDS, GROWING, PROFILES, Bench, moments
+from faulty import COMMANDS, GROWING, PRESETS, Bench, moments
 from folders import Listing
 from injections import BOUND, frame
 from reporting import LONG, record
@@ -167,8 +167,8 @@ def test_an_input_that_changes_while_it_is_read_changes_nothing(
 
 KILLED = (
     (
-        "encode compact",
-        "encode paper",
+        "encode default",
+        "encode published",
         "encode several",
         "merge",
         "append",
@@ -255,10 +255,10 @@ def test_a_folder_that_was_moved_aside_comes_back_before_anything_else(bench: Be
     assert seen
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_a_kill_at_a_random_moment_loses_nothing(bench: Bench, profile: str) -> None:
-    name = f"encode {profile}"
-    eager = [("eager_checkpoints",)] if profile == "paper" else []
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_kill_at_a_random_moment_loses_nothing(bench: Bench, preset: str) -> None:
+    name = f"encode {preset}"
+    eager = [("eager_checkpoints",)] if preset == "published" else []
     begun = time.monotonic()
     before = bench.old(name)
     assert bench.run(name, *eager).code == 0
@@ -286,12 +286,12 @@ def test_a_kill_at_a_random_moment_loses_nothing(bench: Bench, profile: str) -> 
     assert kills >= 4
     record(
         "kill -9 at a random moment",
-        {"profile": profile, "kills": kills, "with a checkpoint": checkpoints},
+        {"preset": preset, "kills": kills, "with a checkpoint": checkpoints},
     )
 
 
 def test_a_kill_while_a_checkpoint_is_written_loses_neither_it_nor_the_output(bench: Bench) -> None:
-    name, eager = "encode paper", ("eager_checkpoints",)
+    name, eager = "encode published", ("eager_checkpoints",)
     counted = bench.folder / "operations"
     before = bench.old(name)
     assert bench.run(name, eager, ("at_operation", bench.out, 0, 0, counted)).code == 0
@@ -313,7 +313,7 @@ def test_a_kill_while_a_checkpoint_is_written_loses_neither_it_nor_the_output(be
     record("kill -9 while checkpoints are written", {"kills": killed, "with a checkpoint": resumed})
 
 
-@pytest.mark.parametrize("name", ["encode compact", "decode zarr"])
+@pytest.mark.parametrize("name", ["encode default", "decode zarr"])
 def test_a_living_writer_is_not_disturbed_by_another(bench: Bench, name: str) -> None:
     for number in moments(bench.operations(name), 4):
         bench.old(name)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from faulty import COMMANDS, COMPACT, PROFILES, Bench, Server, moments, values
+from faulty import COMMANDS, COMPACT, PRESETS, Bench, Server, moments, values
 from folders import listing
 from reporting import LONG, record
 from sources import FORMS
@@ -25,8 +25,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 EACH_ALONE = ("render pictures",)
 """Commands with several outputs, each of which is complete or absent by itself."""
 COMMITTED = (
-    "encode compact",
-    "encode paper",
+    "encode default",
+    "encode published",
     "encode several",
     "merge",
     "append",
@@ -64,11 +64,11 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
     bench.old(name)
     moments_of_stages = stages(bench, name, tmp_path / "stages")
     assert moments_of_stages or name.startswith("decode vtp")
-    if name in [f"encode {profile}" for profile in PROFILES]:
+    if name in [f"encode {preset}" for preset in PRESETS]:
         assert {stage for stage, _ in moments_of_stages} >= {
             "scanning",
             "measuring",
-            "training" if "paper" in name else "coding",
+            "training" if "published" in name else "coding",
         }
     for turn, (stage, done) in enumerate(moments_of_stages):
         number = SIGNALS[turn % len(SIGNALS)]
@@ -121,16 +121,16 @@ def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, n
 
 
 STAGES = {
-    "compact": ["scanning", "selecting", "planning", "coding", "measuring"],
-    "paper": ["scanning", "selecting", "gathering", "training", "measuring"],
+    "default": ["scanning", "selecting", "planning", "coding", "measuring"],
+    "published": ["scanning", "selecting", "gathering", "training", "measuring"],
 }
 HOW = ("vanish", "shrink", "grow", "touch", "other")
 QUICK = {
-    ("compact", "scanning", "other"),
-    ("compact", "selecting", "touch"),
-    ("compact", "coding", "shrink"),
-    ("compact", "measuring", "vanish"),
-    ("paper", "training", "other"),
+    ("default", "scanning", "other"),
+    ("default", "selecting", "touch"),
+    ("default", "coding", "shrink"),
+    ("default", "measuring", "vanish"),
+    ("published", "training", "other"),
 }
 
 
@@ -140,26 +140,26 @@ def test_a_source_that_changes_is_refused(bench: Bench, tmp_path: Path, form: st
     if module:
         pytest.importorskip(module)
     tried = 0
-    for profile, stages in STAGES.items():
+    for preset, stages in STAGES.items():
         for stage in stages:
             for how in HOW:
-                if not LONG and (profile, stage, how) not in QUICK:
+                if not LONG and (preset, stage, how) not in QUICK:
                     continue
                 if form == "a mask" and stage != "selecting":
                     continue  # it is read in this stage only
-                check(bench, tmp_path / "source", form, profile, stage, how)
+                check(bench, tmp_path / "source", form, preset, stage, how)
                 tried += 1
     assert tried > 0
     record("a source that changes", {"form": form, "changes": tried})
 
 
-def check(bench: Bench, folder: Path, form: str, profile: str, stage: str, how: str) -> None:
-    what = (profile, stage, how)
+def check(bench: Bench, folder: Path, form: str, preset: str, stage: str, how: str) -> None:
+    what = (preset, stage, how)
     for place in (folder / "here", folder / "other"):
         place.mkdir(parents=True)
     other, _ = FORMS[form](folder / "other", values(7))
     target, words = FORMS[form](folder / "here", values(0))
-    before = bench.old(f"encode {profile}")
+    before = bench.old(f"encode {preset}")
     act = str(other) if how == "other" else how
     if target.is_dir() and how in ("shrink", "grow", "touch"):
         target = target / "c" / "1" / "0" / "0" / "0"  # a chunk
@@ -169,7 +169,7 @@ def check(bench: Bench, folder: Path, form: str, profile: str, stage: str, how: 
         "-o",
         bench.out / "a.fhz",
         "--force",
-        *PROFILES[profile],
+        *PRESETS[preset],
         inject=[("change_at", stage, 0 if stage == "planning" else 1, target, act)],
     )
     assert ended.code == 2, (what, ended.output)
@@ -189,7 +189,9 @@ NOBODY = 65534
 
 
 @pytest.mark.parametrize("force", [True, False])
-@pytest.mark.parametrize("name", ["encode compact", "encode paper", "decode zarr", "decode pvd"])
+@pytest.mark.parametrize(
+    "name", ["encode default", "encode published", "decode zarr", "decode pvd"]
+)
 def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, force: bool) -> None:
     chance = random.Random(0)
     first, second = bench.old(name), bench.new(name)
@@ -228,7 +230,7 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
     )
 
 
-@pytest.mark.parametrize("name", ["encode compact", "decode zarr"])
+@pytest.mark.parametrize("name", ["encode default", "decode zarr"])
 def test_what_appears_while_it_is_made_is_not_replaced_without_leave(
     bench: Bench, name: str
 ) -> None:
@@ -330,14 +332,14 @@ def test_a_source_that_may_not_be_read_is_said_in_one_line(
 
 
 PLACES = [
-    ("encode compact", "fhash_codec.features.scan", "row_sums"),
-    ("encode compact", "fhash_formats.transform.tile", "_coded"),
-    ("encode compact", "fhash_codec.compact.encode", "code"),
-    ("encode compact", "fhash_codec.encoding", "measure"),
-    ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),
-    ("encode paper", "fhash_codec.paper.fit", "load_checkpoint"),
-    ("encode paper", "fhash_codec.paper.fit", "train"),
-    ("encode paper", "fhash_codec.paper.encode", "write_tables"),
+    ("encode default", "fhash_codec.features.scan", "row_sums"),
+    ("encode default", "fhash_formats.transform.tile", "_coded"),
+    ("encode default", "fhash_codec.compact.encode", "code"),
+    ("encode default", "fhash_codec.encoding", "measure"),
+    ("encode default", "fhash_formats.container.writer", "ContainerWriter._tail"),
+    ("encode published", "fhash_codec.paper.fit", "load_checkpoint"),
+    ("encode published", "fhash_codec.paper.fit", "train"),
+    ("encode published", "fhash_codec.paper.encode", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read_steps"),
     ("decode h5", "fhash_formats.writers.labelled", "_create_hdf5"),
     ("decode zarr", "fhash_formats.writers.labelled", "flush"),
@@ -357,9 +359,11 @@ def test_no_memory_anywhere_is_one_line(bench: Bench, name: str, module: str, pl
     assert bench.now() == before
 
 
-@pytest.mark.parametrize("name", ["encode compact", "encode paper", "decode zarr", "render gif"])
+@pytest.mark.parametrize(
+    "name", ["encode default", "encode published", "decode zarr", "render gif"]
+)
 def test_no_memory_at_any_stage_is_one_line(bench: Bench, name: str) -> None:
-    stage = {"encode compact": "coding", "encode paper": "training"}.get(
+    stage = {"encode default": "coding", "encode published": "training"}.get(
         name, "decoding" if "decode" in name else "rendering"
     )
     before = bench.old(name)

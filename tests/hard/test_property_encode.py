@@ -125,7 +125,7 @@ def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
         common["width"] = draw(st.integers(1, 16))
         common["learning_rate"] = draw(st.sampled_from([1e-8, 0.01, 1.0]))
         return EncodeConfig(
-            profile="paper",
+            preset="published",
             epochs=draw(st.integers(1, 3)),
             psnr=draw(st.sampled_from([None, None, 20.0])),
             **common,
@@ -165,7 +165,7 @@ def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
 @example(
     task=(
         FAR,
-        EncodeConfig(features=("interval:0:2e16",), profile="paper", tables="float16", epochs=1),
+        EncodeConfig(features=("interval:0:2e16",), preset="published", tables="float16", epochs=1),
     )
 )
 def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
@@ -232,8 +232,8 @@ def check(
     found = decoded[kept]
     if whole and decoded.dtype.kind == "f":  # the nearest floats of integers
         ends = [float(end) for end in ends]
-        assert (found.astype(decoded.dtype) % 1 == 0).all() or config.profile == "paper"
-    if config.profile == "compact":
+        assert (found.astype(decoded.dtype) % 1 == 0).all() or config.published
+    if not config.published:
         assert ends[0] <= found.min().item()
         assert found.max().item() <= ends[1]
     exact = np.array([Fraction(each) if whole else each for each in found.tolist()])
@@ -268,6 +268,6 @@ def check(
 def promised_psnr(config: EncodeConfig) -> float | None:
     """Return the PSNR over all values that the settings promise, in dB; None without one."""
     others = (config.max_error, config.max_error_rel, config.ratio)
-    if config.psnr is None and config.profile == "compact" and others == (None, None, None):
+    if config.psnr is None and not config.published and others == (None, None, None):
         return 50.0
     return config.psnr

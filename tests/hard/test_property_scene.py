@@ -235,7 +235,7 @@ VOLUMES: dict[str, tuple[tuple[int, ...], EncodeConfig]] = {
         (3, 6, 7, 8),
         EncodeConfig(effort=1, features=("interval:0.2:2",), dilation=0),
     ),
-    "paper": ((3, 6, 7, 8), EncodeConfig(profile="paper", tables="float16", epochs=1, width=4)),
+    "paper": ((3, 6, 7, 8), EncodeConfig(preset="published", tables="float16", epochs=1, width=4)),
     "a plane": ((2, 1, 7, 8), EncodeConfig(effort=1)),
     "one vertex": ((1, 1, 1, 1), EncodeConfig(effort=1)),
 }

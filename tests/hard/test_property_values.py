@@ -255,9 +255,9 @@ SETTINGS = {
     "compact, a feature": EncodeConfig(
         effort=1, tile="4x4x4x4", features=("interval:0.2:2",), dilation=0
     ),
-    "paper": EncodeConfig(profile="paper", tables="float16", epochs=1, width=4),
+    "paper": EncodeConfig(preset="published", tables="float16", epochs=1, width=4),
     "paper, a feature": EncodeConfig(
-        profile="paper",
+        preset="published",
         tables="float16",
         epochs=1,
         width=4,

@@ -130,34 +130,34 @@ def opened(
         yield series
 
 
-def _profiles() -> tuple[str, ...]:
-    from fhash_bench.rate.measuring import PROFILES
+def _presets() -> tuple[str, ...]:
+    from fhash_codec.config import PRESETS
 
-    return (*PROFILES, NONE)
+    return (*PRESETS, NONE)
 
 
-def _accesses() -> tuple[str, ...]:
-    from fhash_codec.config import ACCESSES
+def _presets_of_table() -> tuple[str, ...]:
+    from fhash_codec.config import PRESETS, PUBLISHED
 
-    return ACCESSES
+    return tuple(name for name in PRESETS if name != PUBLISHED)
 
 
 @click.command(
     "rate",
     cls=BaseCommand,
     short_help="size, speed and access beside other codecs, at equal quality",
-    epilog="fhash bench rate demo/vortex.h5 --profile compact --target 50 --bound 0.01",
+    epilog="fhash bench rate demo/vortex.h5 --preset default --target 50 --bound 0.01",
 )
 @click.argument("data", type=click.Path())
 @series_options
 @quality_options
 @peer_option
 @click.option(
-    "--profile",
-    "profiles",
-    type=one_of("profile", _profiles),
+    "--preset",
+    "presets",
+    type=one_of("preset", _presets),
     multiple=True,
-    help="Of fhash, or none; repeat. Default: all.",
+    help="Of fhash, or none; repeat. Default: default and published.",
 )
 @click.option(
     "--speed/--no-speed",
@@ -176,7 +176,7 @@ def rate(
     targets: tuple[float, ...],
     bounds: tuple[float, ...],
     peers: tuple[Peer, ...],
-    profiles: tuple[str, ...],
+    presets: tuple[str, ...],
     speed: bool,
     settings: dict[str, Any],
     plot: str | None,
@@ -194,7 +194,7 @@ def rate(
     """
     check_plot(plot, force, [data])
     with Progress(quiet=quiet) as progress, opened(data, source, progress) as series:
-        from fhash_bench.rate.measuring import PEERS, PROFILES
+        from fhash_bench.rate.measuring import MEASURED, PEERS
         from fhash_bench.rate.rate import BOUNDS, TARGETS, bench_rate
         from fhash_bench.rate.rate import plot as draw
 
@@ -206,7 +206,7 @@ def rate(
             bounds=BOUNDS if every else bounds,
             names=filters_of(peers, PEERS),
             named=programs_of(peers),
-            profiles=[name for name in profiles or PROFILES if name != NONE],
+            presets=[name for name in presets or MEASURED if name != NONE],
             speed=speed,
             progress=progress,
         )
@@ -340,11 +340,11 @@ def access_rows(result: RateBench) -> list[tuple[str, ...]]:
     help="Of fhash; repeat. Default: 1, 5 and 7.",
 )
 @click.option(
-    "--access",
-    "accesses",
-    type=one_of("access", _accesses),
+    "--preset",
+    "presets",
+    type=one_of("preset", _presets_of_table),
     multiple=True,
-    help="Of fhash, with each effort; repeat. Default: balanced.",
+    help="Of fhash, with each effort; repeat. Default: default.",
 )
 @click.option(
     "--peer",
@@ -379,7 +379,7 @@ def rate_table(
     targets: tuple[float, ...],
     bounds: tuple[float, ...],
     efforts: tuple[int, ...],
-    accesses: tuple[str, ...],
+    presets: tuple[str, ...],
     peers: tuple[Peer, ...],
     speed: bool,
     settings: dict[str, Any],
@@ -416,7 +416,7 @@ def rate_table(
                 for name in names
             },
             Path(folder),
-            own_coders(efforts or EFFORTS, accesses, settings),
+            own_coders(efforts or EFFORTS, presets, settings),
             targets=TARGETS if every else targets,
             bounds=BOUNDS if every else bounds,
             names=filters_of(peers, FILTERS),

@@ -97,7 +97,7 @@ BRICKS = TextType("N,M", _numbers_of_bricks)
     "batch",
     "device",
     "seed",
-    profile="paper",
+    preset="published",
 )
 @plot_option("Draw PSNR over seconds.")
 @force_option
@@ -242,7 +242,7 @@ def _points(points: list[PointRate]) -> str:
     metavar="NAME",
     multiple=True,
     help="Only this axis; repeat. Axes: encoding, network, key-frames, dilation, fringe, brick,"
-    " batch, schedule, tables (profile paper), effort, tile, stages, stages-of-bound (compact).",
+    " batch, schedule, tables (preset published), effort, tile, stages, stages-of-bound (default).",
 )
 @click.option(
     "--epochs",
@@ -291,7 +291,7 @@ def ablate(
     from fhash_bench.ablate import axes_named
     from fhash_codec.devices import need_torch
 
-    if any(axis.profile == "paper" for axis in axes_named(names)):
+    if any(axis.preset == "published" for axis in axes_named(names)):
         need_torch("bench ablate")
     check_plot(plot, force, [data])
     if data is None:
@@ -342,7 +342,7 @@ def _ablate_text(result: AblateBench) -> str:
         " dB, x: beside the row marked *",
         "numbers: of the model; points: queries between vertices, per second of processors",
         f"{result.series}, {extent(result.shape)}, {', '.join(result.features)}",
-        *(f"{profile}: {settings}" for profile, settings in result.common.items()),
+        *(f"{preset}: {settings}" for preset, settings in result.common.items()),
         *(f"not measured: {reason}" for reason in result.left_out),
     ]
     return "\n".join(lines)

@@ -389,26 +389,26 @@ def _codecs(files: Sequence[FileResult]) -> Answer:
     """Whether F-Hash's files are larger than those of other codecs at a quality."""
     worse: list[float] = []
     coded: list[float] = []
-    compact: list[float] = []
+    default: list[float] = []
     for data_set in dict.fromkeys(file.data_set for file in files):
         here = [file for file in files if file.data_set == data_set and file.reached]
         peers = [file.bytes for file in here if file.kind == "peer"]
         paper = [file.bytes for file in here if file.kind == "paper"]
         ours = [file.bytes for file in here if file.kind == "coded"]
-        own = [file.bytes for file in here if file.kind == "compact" and file.whole]
+        own = [file.bytes for file in here if file.kind == "default" and file.whole]
         if peers and paper:
             worse.append(min(paper) / min(peers))
         if peers and ours:
             coded.append(min(ours) / min(peers))
         if peers and own:
-            compact.append(min(peers) / min(own))
+            default.append(min(peers) / min(own))
     return Answer(
         "F-Hash falls short of SZ3 and TTHRESH in compression",
         "files",
         verdict(worse, 1, 1),
         f"at {TARGET:g} dB over all steps: file of F-Hash / that of the best peer"
         f" {spread(worse, 'x')}, with tables coded by the transform {spread(coded, 'x')};"
-        f" best peer / profile compact {spread(compact, 'x')}; TTHRESH and NeurComp were not run"
+        f" best peer / default preset {spread(default, 'x')}; TTHRESH and NeurComp were not run"
         if worse
         else "no files of F-Hash and a peer at that quality; SZ3, SPERR and ZFP are part of"
         " fhash[bench]",

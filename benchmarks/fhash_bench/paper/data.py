@@ -341,7 +341,7 @@ def gather_data(
         InputError: the settings do not fit the series, or they select nothing.
     """
     config = EncodeConfig(
-        profile="paper",
+        preset="published",
         tables="float16",
         features=(feature_text(name, kind),),
         key_frames=key_frames,

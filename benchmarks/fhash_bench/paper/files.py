@@ -39,8 +39,8 @@ EPOCHS = (20, 40, 80)
 NUMBER_TYPES = ("float32", "float16")
 """Number types of F-Hash's stored tables."""
 EFFORT = 3
-"""Effort of `compact`: a larger one makes smaller files in several times the time."""
-PAPER = {"profile": "paper", "key_frames": "all"}
+"""Effort of the default preset: a larger one makes smaller files in several times the time."""
+PAPER = {"preset": "published", "key_frames": "all"}
 """Settings of the published F-Hash; every step is a key frame, since every step is asked for."""
 
 
@@ -52,7 +52,7 @@ class FileResult:
         data_set, feature: as of a cell.
         codec: its name, with its setting.
         kind: paper, with tables of a number type; coded, with tables that the transform codes;
-            compact or peer.
+            default or peer.
         whole: whether the file holds the whole domain; else the coreset of the feature alone.
         bytes: on disk.
         raw_bytes: the values of all steps in the source's number type.
@@ -92,7 +92,7 @@ def measure_files(
     number_types: Sequence[str] = NUMBER_TYPES,
     progress: Progress = silent,
 ) -> tuple[list[FileResult], list[str]]:
-    """Encode a series by F-Hash, by `compact` and by the peers that are installed.
+    """Encode a series by F-Hash as published, by the default preset and by the installed peers.
 
     Args:
         data_set: name, as of a cell.
@@ -114,7 +114,7 @@ def measure_files(
             for name in number_types
         },
         "F-Hash, coded tables": lambda: [made.coded()],
-        "compact": lambda: [made.compact()],
+        "default": lambda: [made.default()],
         ", ".join(PEERS): made.peers,
     }
     results = []
@@ -159,20 +159,20 @@ class _Files:
         settings = {**PAPER, "tables": "transform", "psnr": self.target}
         return self._encoded("F-Hash, tables coded by the transform", "coded", settings)
 
-    def compact(self) -> FileResult:
-        """The product's default profile on the feature."""
-        settings = {"profile": "compact", "psnr": self.target, "effort": EFFORT}
-        return self._encoded(f"compact, effort {EFFORT}", "compact", settings)
+    def default(self) -> FileResult:
+        """The default preset on the feature."""
+        settings = {"psnr": self.target, "effort": EFFORT}
+        return self._encoded(f"default preset, effort {EFFORT}", "default", settings)
 
     def peers(self) -> list[FileResult]:
-        """Codecs of the whole domain: the peers, and `compact`."""
+        """Codecs of the whole domain: the peers, and the default preset."""
         bench = bench_rate(
             self.series,
             {"effort": EFFORT},
             targets=(self.target,),
             bounds=(),
             names=PEERS,
-            profiles=("compact",),
+            presets=("default",),
             speed=False,
             price_tiles=False,
             progress=self.progress,
@@ -182,8 +182,8 @@ class _Files:
             FileResult(
                 data_set=self.data_set,
                 feature=self.kind,
-                codec=point.setting if point.codec in PEERS else f"compact, effort {EFFORT}",
-                kind="peer" if point.codec in PEERS else "compact",
+                codec=point.setting if point.codec in PEERS else f"default preset, effort {EFFORT}",
+                kind="peer" if point.codec in PEERS else "default",
                 whole=True,
                 bytes=point.bytes,
                 raw_bytes=bench.raw_bytes,

@@ -25,7 +25,7 @@ PARTS = (
 )
 """Names of the parts that can be measured."""
 NETWORK_PARTS = ("streams", "break-even")
-"""Names of the parts that march through a network, which a file of the profile paper alone has."""
+"""Names of the parts that march through a network, which the published network alone has."""
 
 
 @dataclass(frozen=True, kw_only=True)

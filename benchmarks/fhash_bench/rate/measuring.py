@@ -28,7 +28,7 @@ from fhash_bench.rate.peers import (
     there_and_back,
 )
 from fhash_codec.boxes import Box
-from fhash_codec.config import MODELS, EncodeConfig
+from fhash_codec.config import PUBLISHED, EncodeConfig
 from fhash_codec.cost.peers import EXACT, UNIFORM, Search, Trial, Variant, filled, trial_of
 from fhash_codec.measure.errors import Errors
 from fhash_codec.measure.value_range import decoded_type
@@ -40,14 +40,14 @@ from fhash_formats.series import ArraySeries, Series
 PEERS = ("SZ3", "SPERR", "ZFP", "BitRound", "Blosc")
 """Names of the peers."""
 OWN = "fhash "
-"""Prefix of the names of fhash's own profiles among the codecs."""
+"""Prefix of the names of fhash's own presets among the codecs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
     """The smallest size at which a codec reached a quality, or the closest it came."""
 
-    codec: Annotated[str, "name of a peer, or 'fhash PROFILE'"]
+    codec: Annotated[str, "name of a peer, or 'fhash PRESET'"]
     goal: Annotated[str, "`psnr` (dB) or `bound` (share of the range)"]
     asked: Annotated[float, "the quality"]
     reached: Annotated[bool, "whether the codec reached it"]
@@ -105,7 +105,7 @@ class BestPeer(TypedDict):
     asked: Annotated[float, "dB, or share of the range"]
     peer: Annotated[str | None, "its name; null where none reached it"]
     bytes: Annotated[int | None, "that it took"]
-    ratios: Annotated[dict[str, float | None], "its bytes over those of each profile of fhash"]
+    ratios: Annotated[dict[str, float | None], "its bytes over those of each preset of fhash"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +121,7 @@ class RateBench:
     points: Annotated[tuple[Point, ...], "size of each codec at each quality"]
     speeds: Annotated[tuple[Speed, ...], "speed of each codec"]
     access: Annotated[tuple[Access, ...], "access to a small region"]
-    tiles: Annotated[tuple[TilePrice, ...], "price of the tiles of the profile compact"]
+    tiles: Annotated[tuple[TilePrice, ...], "price of the tiles of the default preset"]
     refused: Annotated[dict[str, str], "reasons by codec that could not be measured"]
     machine: Annotated[dict[str, Any], "date, command line, processor, load, versions and more"]
     notes: Annotated[tuple[str, ...], "how the figures were taken"]
@@ -157,32 +157,33 @@ class RateBench:
         return {**asdict(self), "best_peers": self.best_peers()}
 
 
-PROFILES = tuple(MODELS)
-"""Every profile there is."""
+MEASURED = ("default", PUBLISHED)
+"""Presets that are measured where none is named: one of each model."""
 
 
-def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float) -> EncodeConfig:
-    """Settings of a profile that promise a quality.
+def promised(settings: Mapping[str, Any], preset: str, goal: str, asked: float) -> EncodeConfig:
+    """Settings of a preset that promise a quality.
 
-    Settings that belong to other profiles are left out. The paper profile is not steered by
+    Settings that belong to other presets are left out. The published network is not steered by
     quality: its settings are the same for every goal.
 
     Args:
         settings: settings by name.
-        profile: name of the profile.
+        preset: its name.
         goal: `psnr` (dB) or `bound` (largest error as a share of the range).
         asked: the quality.
     """
+    published = preset == PUBLISHED
     others = {
         field.name
         for field in dataclasses.fields(EncodeConfig)
-        if field.metadata.get("profile", profile) != profile
+        if field.metadata.get("published", published) is not published
     }
     own = {name: value for name, value in settings.items() if name not in others}
-    if profile == "paper":
-        return EncodeConfig.from_dict({"tables": "float16"} | own | {"profile": profile})
+    if published:
+        return EncodeConfig.from_dict({"tables": "float16"} | own | {"preset": preset})
     promise = {"psnr" if goal == "psnr" else "max_error_rel": asked}
-    return EncodeConfig.from_dict(own | {"profile": profile} | promise)
+    return EncodeConfig.from_dict(own | {"preset": preset} | promise)
 
 
 class Own:
@@ -217,7 +218,7 @@ class Own:
         self.times.setdefault(config, []).append(spent(encode))
 
     def has_one_tile(self, config: EncodeConfig) -> bool:
-        """Whether the file with these settings, of the profile compact, has a single tile."""
+        """Whether the file with these settings, but for published, has a single tile."""
         with open_volume(self._paths[config]) as volume:
             table = volume.container.arrays["tables/level_1"]
             return prod(table.grid) == 1
@@ -354,7 +355,7 @@ class Bench:
     """One run of the bench: the data, and the best trial so far by quality and codec.
 
     Attributes:
-        price_tiles: whether the profile compact is also encoded as one tile.
+        price_tiles: whether the default preset is also encoded as one tile.
     """
 
     price_tiles = True
@@ -435,28 +436,28 @@ class Bench:
 
         return Search(measure, step=variant.step, fixed=variant.lossless)
 
-    def search_profile(self, settings: Mapping[str, Any], profile: str) -> None:
-        """Encode with a profile for every goal."""
+    def search_preset(self, settings: Mapping[str, Any], preset: str) -> None:
+        """Encode with a preset for every goal."""
         for goal, asked in self.goals:
-            config = promised(settings, profile, goal, asked)
+            config = promised(settings, preset, goal, asked)
             self.done += 1
-            self.progress("comparing", self.done, self.total, f"fhash {profile}")
+            self.progress("comparing", self.done, self.total, f"{OWN}{preset}")
             trial = self.own.trial(config)
             # A bound is kept in data units; the division by the range may round the share up.
             reached = (
                 trial.psnr >= asked if goal == "psnr" else trial.max_error <= asked * (1 + 1e-12)
             )
-            as_asked = reached if goal == "bound" and profile != "paper" else None
+            as_asked = reached if goal == "bound" and not config.published else None
             best = Best(
-                codec=f"{OWN}{profile}",
+                codec=f"{OWN}{preset}",
                 trial=trial,
-                setting=f"{OWN}{profile}",
+                setting=f"{OWN}{preset}",
                 reached=reached,
                 as_asked=as_asked,
                 how=config,
             )
             self._keep((goal, asked), best)
-            if profile == "compact" and self.price_tiles:
+            if preset == "default" and self.price_tiles:
                 self._price_tiles(goal, asked, config, trial)
 
     def _price_tiles(self, goal: str, asked: float, config: EncodeConfig, trial: Trial) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from fhash_bench.rate.measuring import OWN, PEERS, PROFILES, Bench, Point, RateBench, promised
+from fhash_bench.rate.measuring import MEASURED, OWN, PEERS, Bench, Point, RateBench, promised
 from fhash_bench.rate.peers import PROGRAMS, AnyVariant, all_filters, programs
+from fhash_codec.config import PRESETS
 from fhash_codec.cost.report import require_matplotlib
 from fhash_codec.devices import machine
 from fhash_codec.features.scan import scan
@@ -51,32 +52,32 @@ def bench_rate(
     bounds: Sequence[float] = BOUNDS,
     names: Sequence[str] = PEERS,
     named: Mapping[str, str] | None = None,
-    profiles: Sequence[str] = PROFILES,
+    presets: Sequence[str] = MEASURED,
     speed: bool = True,
     price_tiles: bool = True,
     progress: Progress = silent,
 ) -> RateBench:
-    """Measure fhash's profiles and its peers on a series, which is held in memory.
+    """Measure presets of fhash and its peers on a series, which is held in memory.
 
     Everything is measured on decoded values.
 
     Args:
         source: a file, a Series or an array.
-        settings: further settings of fhash by name, as for `EncodeConfig.from_dict`; each profile
+        settings: further settings of fhash by name, as for `EncodeConfig.from_dict`; each preset
             takes those it has. A feature is refused, since the whole domain counts here.
         targets: PSNR in dB over every finite value of all frames, with the range of the series.
         bounds: largest errors as shares of that range.
         names: peers, of PEERS.
         named: paths of programs by their names, of PROGRAMS, which are peers as well.
-        profiles: profiles of fhash.
-        price_tiles: also encode the profile compact as one tile.
+        presets: of fhash.
+        price_tiles: also encode the default preset as one tile.
         speed: also measure encoding, decoding and access, at the target nearest to SPEED_AT.
 
     Raises InputError for what cannot be measured, or a path without a program;
     MissingDependencyError without hdf5plugin.
     """
     settings = settings or {}
-    check(settings, targets, bounds, [*names, *(named or {})], profiles)
+    check(settings, targets, bounds, [*names, *(named or {})], presets)
     variants, refused = all_variants(names, named or {})
     with (
         open_source(source) as series,
@@ -88,11 +89,11 @@ def bench_rate(
         bench.price_tiles = price_tiles
         chosen = [variant for several in variants.values() for variant in several]
         peer_trials = sum(goal in variant.goals for variant in chosen for goal, _ in goals)
-        bench.total = peer_trials + len(goals) * len(profiles)
+        bench.total = peer_trials + len(goals) * len(presets)
         for variant in chosen:
             bench.search(variant)
-        for profile in profiles:
-            bench.search_profile(settings, profile)
+        for preset in presets:
+            bench.search_preset(settings, preset)
         if speed and targets:
             nearest = min(targets, key=lambda target: (abs(target - SPEED_AT), target))
             bench.measure_speed(nearest, variants)
@@ -152,11 +153,11 @@ def check(
     targets: Sequence[float],
     bounds: Sequence[float],
     names: Sequence[str],
-    profiles: Sequence[str],
+    presets: Sequence[str],
 ) -> None:
     """Raise InputError for arguments of `bench_rate` that are not allowed."""
     every = (*PEERS, *PROGRAMS)
-    for what, given, allowed in (("peer", names, every), ("profile", profiles, PROFILES)):
+    for what, given, allowed in (("peer", names, every), ("preset", presets, PRESETS)):
         for name in given:
             if name not in allowed:
                 raise InputError(f"{what} is '{name}'; allowed: {', '.join(allowed)}")
@@ -166,17 +167,17 @@ def check(
     for bound in bounds:
         if not 1e-9 <= bound <= 0.5:
             raise InputError(f"bound is {bound:g} of the range; allowed: 1e-9 to 0.5")
-    if not (targets or bounds) or not (names or profiles):
+    if not (targets or bounds) or not (names or presets):
         raise InputError(
-            "nothing to measure; give at least one target or bound, and one peer or profile"
+            "nothing to measure; give at least one target or bound, and one peer or preset"
         )
     if tuple(settings.get("features", ("all",))) != ("all",):
         raise InputError(
             f"feature is {', '.join(settings['features'])};"
             " bench rate compares whole domains, leave it out"
         )
-    for profile in profiles:
-        promised(settings, profile, "psnr", SPEED_AT)
+    for preset in presets:
+        promised(settings, preset, "psnr", SPEED_AT)
 
 
 COLOURS = {

@@ -64,7 +64,7 @@ class RateCell:
     shape: Annotated[tuple[int, ...], "(t, z, y, x)"]
     dtype: Annotated[str, "number type"]
     raw_bytes: Annotated[int, "size of the array"]
-    codec: Annotated[str, "name of a peer, or of fhash with its effort and its access"]
+    codec: Annotated[str, "name of a peer, or of fhash with its effort and its preset"]
     goal: Annotated[str, "`psnr` in dB, or `bound`"]
     asked: Annotated[float, "dB, or share of the range"]
     reached: Annotated[bool, "whether the codec reached it; if not, figures of its closest trial"]
@@ -97,8 +97,8 @@ EFFORTS = (1, 5, 7)
 """Efforts of fhash: the fastest, the default, and a thorough one."""
 FILTERS = ("SPERR", "SZ3", "ZFP")
 """Peers."""
-COMPACT = "compact"
-"""The profile that is measured."""
+DEFAULT = "default"
+"""The preset of settings that name none."""
 CSV = "table.csv"
 """Name of the table beside the cells, which grows with them."""
 NOTES = (
@@ -134,17 +134,17 @@ class RateTable:
 
 
 def own_coders(
-    efforts: Sequence[int], accesses: Sequence[str], settings: Mapping[str, Any]
+    efforts: Sequence[int], presets: Sequence[str], settings: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Settings of fhash by name, such as "fhash 5 fast": each effort with each access."""
+    """Settings of fhash by name, such as "fhash 5 fast": each effort with each preset."""
     return {
-        f"{OWN}{effort} {access}".removesuffix(" balanced"): {
+        f"{OWN}{effort} {preset}".removesuffix(f" {DEFAULT}"): {
             **settings,
             "effort": effort,
-            "access": access,
+            "preset": preset,
         }
         for effort in efforts
-        for access in accesses or ("balanced",)
+        for preset in presets or (DEFAULT,)
     }
 
 
@@ -160,7 +160,7 @@ def bench_table(
     speed: bool = True,
     progress: Progress = silent,
 ) -> RateTable:
-    """Measure the profile compact and its peers on several series; every cell is kept at once.
+    """Measure fhash and its peers on several series; every cell is kept at once.
 
     Args:
         sources: functions that open series, by name.
@@ -173,10 +173,15 @@ def bench_table(
     Raises errors as `bench_rate` does, and OutputError where a cell cannot be written.
     """
     for settings in coders.values():
-        check(settings, targets, bounds, [*names, *(named or {})], [COMPACT])
+        check(
+            settings, targets, bounds, [*names, *(named or {})], [settings.get("preset", DEFAULT)]
+        )
     variants, refused = all_variants(names, named or {})
     searches: dict[str, tuple[Any, Search]] = {
-        name: (settings, partial(Bench.search_profile, settings=settings, profile=COMPACT))
+        name: (
+            settings,
+            partial(Bench.search_preset, settings=settings, preset=settings.get("preset", DEFAULT)),
+        )
         for name, settings in coders.items()
     }
     for codec, several in variants.items():

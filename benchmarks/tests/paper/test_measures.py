@@ -87,7 +87,7 @@ def test_the_figures_are_those_of_the_codec(
 ) -> None:
     """The numbers of a container, in the bench's model: `fhash info` prints the same quality."""
     config = EncodeConfig(
-        profile="paper",
+        preset="published",
         features=("interval:0.2:2",),
         key_frames="0,2,4",
         dilation=DILATION,

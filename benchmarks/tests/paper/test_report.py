@@ -138,7 +138,7 @@ class Encodings:
 @pytest.fixture
 def encodings(monkeypatch: pytest.MonkeyPatch) -> Encodings:
     bench = SimpleNamespace(
-        points=[point("SZ3", 900), point("ZFP", 700, reached=False), point("fhash compact", 300)],
+        points=[point("SZ3", 900), point("ZFP", 700, reached=False), point("fhash default", 300)],
         refused={"SPERR rate": "too small"},
         raw_bytes=10_000,
     )
@@ -155,7 +155,7 @@ def test_files_are_encoded_until_they_have_the_quality(encodings: Encodings) -> 
         kind="segmentation",
         progress=lambda *w: told.append(w),
     )
-    paper = [config for config in encodings.configs if config.profile == "paper"]
+    paper = [config for config in encodings.configs if config.published]
     assert [(config.tables, config.epochs) for config in paper[:4]] == [
         ("float32", 20),
         ("float32", 40),
@@ -168,10 +168,10 @@ def test_files_are_encoded_until_they_have_the_quality(encodings: Encodings) -> 
         ("paper", False, True),
         ("paper", False, True),
         ("coded", False, True),
-        ("compact", False, True),
+        ("default", False, True),
         ("peer", True, True),
         ("peer", True, False),
-        ("compact", True, True),
+        ("default", True, True),
     ]
     assert results[0].ratio == 20
     assert results[0].codec == "F-Hash, float32, 40 epochs"
@@ -188,7 +188,7 @@ def test_without_peers_a_line_says_so(
 
     monkeypatch.setattr(files, "bench_rate", refuse)
     results, refused = measure_files("mine", SERIES, "all")
-    assert {each.kind for each in results} == {"paper", "coded", "compact"}
+    assert {each.kind for each in results} == {"paper", "coded", "default"}
     assert refused == ["SZ3, SPERR, ZFP not measured: pip install 'fhash[bench]'"]
 
 
@@ -311,11 +311,11 @@ def result(kind: str, bytes: int, **others: Any) -> FileResult:
 
 
 def test_files_beside_other_codecs() -> None:
-    files = [result("paper", 9000), result("peer", 3000), result("compact", 1500)]
+    files = [result("paper", 9000), result("peer", 3000), result("default", 1500)]
     files.append(result("coded", 3600))
     found = answer("compression", files=files)
     assert found.verdict == CONFIRMED
-    assert "3x, with tables coded by the transform 1.2x; best peer / profile compact 2x" in (
+    assert "3x, with tables coded by the transform 1.2x; best peer / default preset 2x" in (
         found.figures
     )
     small = [result("paper", 900), *files[1:]]

@@ -385,7 +385,7 @@ def test_sizes_are_measured_until_arm_has_lost(
     path = tmp_path / "a.fhz"
     field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
     fhash_codec.encode(
-        field, path, EncodeConfig(profile="paper", tables="float16", epochs=1, width=4)
+        field, path, EncodeConfig(preset="published", tables="float16", epochs=1, width=4)
     )
     with fhash_codec.open(path) as volume:
         pairs = break_even(volume, Scene(), 1, 16, silent)
@@ -481,7 +481,7 @@ def test_marches_through_a_network_are_measured(
     encode(
         field,
         tmp_path / "a.fhz",
-        EncodeConfig(profile="paper", tables="float16", epochs=1, width=4),
+        EncodeConfig(preset="published", tables="float16", epochs=1, width=4),
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         result = bench_render(volume, parts=NETWORK_PARTS, size=16, turns=1)

@@ -29,9 +29,9 @@ def field() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(scope="session")
 def result() -> RateBench:
-    """Every peer and the profile paper, measured at two targets and one bound."""
+    """Every peer and the preset published, measured at two targets and one bound."""
     config = {"epochs": 2, "width": 4, "seed": 1}
-    return bench_rate(wave(), config, targets=(35.0, 50.0), bounds=(0.02,), profiles=("paper",))
+    return bench_rate(wave(), config, targets=(35.0, 50.0), bounds=(0.02,), presets=("published",))
 
 
 TTHRESH = """

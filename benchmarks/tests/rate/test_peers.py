@@ -211,7 +211,7 @@ def test_programs_are_measured_like_other_peers(
         bounds=(0.05,),
         names=(),
         named={"tthresh": tthresh, "qoz": qoz, "hevc": ffmpeg, "vvc": ffmpeg},
-        profiles=(),
+        presets=(),
     )
     points = {(point.codec, point.goal): point for point in result.points}
     assert points.keys() == {
@@ -238,7 +238,7 @@ def test_a_failing_program_is_said_in_one_line(
         bounds=(),
         names=(),
         named={"tthresh": broken},
-        profiles=(),
+        presets=(),
     )
     assert result.points == ()
     assert set(result.refused.values()) == {

@@ -29,7 +29,6 @@ from fhash_bench.rate.generated import (
 )
 from fhash_bench.rate.measuring import (
     PEERS,
-    PROFILES,
     Own,
     Point,
     RateBench,
@@ -44,6 +43,7 @@ from fhash_bench.rate.rate import bench_rate, plot
 from fhash_bench.rate.table import CSV, RateCell, Request, bench_table, own_coders
 from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
+from fhash_codec.config import PRESETS
 from fhash_codec.cost.peers import EXACT, Trial
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import ArraySeries
@@ -152,7 +152,7 @@ def test_tolerances_are_checked_for_bounds_alone(result: RateBench) -> None:
         "ZFP": True,
         "BitRound": None,
         "Blosc": None,
-        "fhash paper": None,
+        "fhash published": None,
     }
     assert all(point.as_asked is None for point in result.points if point.goal == "psnr")
 
@@ -177,7 +177,7 @@ def test_speed_and_access_are_those_of_the_target_nearest_to_50_db(result: RateB
 
 def test_small_chunks_are_measured_where_frames_are_larger(field: Field) -> None:
     values = field((2, 6, 130, 120))
-    result = bench_rate(values, targets=(50.0,), bounds=(), names=("SZ3",), profiles=())
+    result = bench_rate(values, targets=(50.0,), bounds=(), names=("SZ3",), presets=())
     whole, small = result.access
     assert whole.bytes < small.bytes
     assert small.bytes_read < whole.bytes_read
@@ -187,7 +187,7 @@ def test_small_chunks_are_measured_where_frames_are_larger(field: Field) -> None
 def test_what_a_filter_refuses_is_said(field: Field) -> None:
     values = field((1, 1, 1, 64))
     result = bench_rate(
-        values, targets=(40.0,), bounds=(0.01,), names=("SPERR", "ZFP"), profiles=(), speed=False
+        values, targets=(40.0,), bounds=(0.01,), names=("SPERR", "ZFP"), presets=(), speed=False
     )
     assert {point.codec for point in result.points} == {"ZFP"}
     assert all(name.startswith("SPERR ") for name in result.refused)
@@ -196,7 +196,7 @@ def test_what_a_filter_refuses_is_said(field: Field) -> None:
 
 def test_own_figures_are_those_of_diff(tmp_path: Path, field: Field) -> None:
     values = field()
-    config = EncodeConfig(profile="paper", tables="float16", epochs=2, width=4)
+    config = EncodeConfig(preset="published", tables="float16", epochs=2, width=4)
     data_range = float(values.max()) - float(values.min())
     own = Own(ArraySeries(values), data_range, tmp_path)
     trial = own.trial(config)
@@ -211,15 +211,15 @@ def test_own_figures_are_those_of_diff(tmp_path: Path, field: Field) -> None:
     assert min(taken.wall, taken.core) > 0
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_profiles_are_promised_what_they_can_keep(profile: str) -> None:
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_promised_what_they_can_keep(preset: str) -> None:
     settings = {"seed": 7, "epochs": 3, "effort": 2}
-    quality = promised(settings, profile, "psnr", 41.0).to_dict()
-    bound = promised(settings, profile, "bound", 0.02).to_dict()
-    assert (quality["epochs"], quality["effort"]) == ((3, 5) if profile == "paper" else (0, 2))
-    assert quality["profile"] == bound["profile"] == profile
+    quality = promised(settings, preset, "psnr", 41.0).to_dict()
+    bound = promised(settings, preset, "bound", 0.02).to_dict()
+    assert (quality["epochs"], quality["effort"]) == ((3, 5) if preset == "published" else (0, 2))
+    assert quality["preset"] == bound["preset"] == preset
     assert quality["seed"] == bound["seed"] == 7
-    if profile == "paper":
+    if preset == "published":
         assert quality == bound
         assert quality["psnr"] is None
     else:
@@ -263,21 +263,21 @@ def test_ratios_are_to_the_best_peer_that_reached_it() -> None:
         point("SZ3", 300, True),
         point("ZFP", 100, False),
         point("SPERR", 200, True),
-        point("fhash compact", 80, True),
+        point("fhash default", 80, True),
     )
     row = {
         "goal": "psnr",
         "asked": 45.0,
         "peer": "SPERR",
         "bytes": 200,
-        "ratios": {"fhash compact": 2.5},
+        "ratios": {"fhash default": 2.5},
     }
     assert result(points).best_peers() == result(points).to_dict()["best_peers"] == [row]
-    unreached = result((*points[:3], point("fhash compact", 80, False)))
-    assert unreached.best_peers() == [row | {"ratios": {"fhash compact": None}}]
+    unreached = result((*points[:3], point("fhash default", 80, False)))
+    assert unreached.best_peers() == [row | {"ratios": {"fhash default": None}}]
     alone = result(points[3:])
     assert alone.best_peers() == [
-        row | {"peer": None, "bytes": None, "ratios": {"fhash compact": None}}
+        row | {"peer": None, "bytes": None, "ratios": {"fhash default": None}}
     ]
 
 
@@ -435,7 +435,7 @@ def test_the_plot_has_a_panel_for_each_kind_of_quality(result: RateBench, tmp_pa
 def test_every_codec_has_a_point_for_everything_asked(result: RateBench) -> None:
     expected = {
         (codec, *goal)
-        for codec in (*PEERS, "fhash paper")
+        for codec in (*PEERS, "fhash published")
         for goal in (("psnr", 35.0), ("psnr", 50.0), ("bound", 0.02))
     }
     assert {(point.codec, point.goal, point.asked) for point in result.points} == expected
@@ -449,7 +449,7 @@ def test_missing_values_do_not_count(field: Field) -> None:
     values[2, 0, 0, 0] = -np.inf
     config = {"epochs": 1, "width": 4}
     result = bench_rate(
-        values, config, targets=(40.0,), bounds=(0.01,), profiles=("paper",), speed=False
+        values, config, targets=(40.0,), bounds=(0.01,), presets=("published",), speed=False
     )
     assert result.missing == 6 * 6 * 7 + 1
     assert all(point.reached for point in result.points if point.codec in PEERS)
@@ -460,7 +460,7 @@ def test_missing_values_do_not_count(field: Field) -> None:
 def test_integers_are_compared_as_they_are(field: Field) -> None:
     values = np.round(100 * field()).astype(np.int16)
     result = bench_rate(
-        values, targets=(40.0,), bounds=(0.05,), names=("SZ3", "Blosc"), profiles=(), speed=False
+        values, targets=(40.0,), bounds=(0.05,), names=("SZ3", "Blosc"), presets=(), speed=False
     )
     assert result.raw_bytes == values.nbytes
     assert all(point.reached for point in result.points)
@@ -471,11 +471,11 @@ def test_integers_are_compared_as_they_are(field: Field) -> None:
     ("arguments", "message"),
     [
         ({"names": ("TTHRESH",)}, "peer is 'TTHRESH'; allowed: SZ3, "),
-        ({"profiles": ("small",)}, "profile is 'small'; allowed: "),
+        ({"presets": ("tiny",)}, "preset is 'tiny'; allowed: "),
         ({"targets": (3.0,)}, "target is 3 dB; allowed: 5 to 200"),
         ({"bounds": (0.0,)}, "bound is 0 of the range"),
         ({"targets": (), "bounds": ()}, "nothing to measure"),
-        ({"names": (), "profiles": ()}, "nothing to measure"),
+        ({"names": (), "presets": ()}, "nothing to measure"),
         ({"settings": {"efort": 1}}, "did you mean 'effort'"),
         ({"settings": {"features": ("interval:0:1",)}}, "feature is interval:0:1"),
     ],

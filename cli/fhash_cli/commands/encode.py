@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import glob
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -36,7 +35,7 @@ from fhash_cli.output import (
     emit,
     extent,
     loss_rows,
-    number,
+    model_name,
     one_line,
     quality_rows,
     say,
@@ -51,7 +50,6 @@ from fhash_formats.errors import FhashWarning, InterruptedEncodingError, Quality
 if TYPE_CHECKING:
     from fhash_codec.comparison import EncodeReport
     from fhash_codec.config import EncodeConfig
-    from fhash_codec.cost.encodings import ModelChoice, ModelsCompared
     from fhash_codec.cost.prediction import Choice, TimeBudget
     from fhash_codec.encoding import DatasetReport
     from fhash_formats.series import Series
@@ -78,7 +76,6 @@ class EncodeOptions:
 class Chosen(TypedDict, total=False):
     """Choices made for the user, beside the figures of the file."""
 
-    models: Annotated[ModelsCompared, "`--profile auto`: the choice between both models"]
     time_budget: Annotated[TimeBudget, "`--time-budget`: the choice of effort or epochs"]
 
 
@@ -110,9 +107,9 @@ class Chosen(TypedDict, total=False):
 @click.option(
     "--time-budget",
     type=DURATION,
-    help="Choose the highest effort, or with --profile paper the most epochs, that should take no "
-    "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
-    "that may be chosen.",
+    help="Choose the highest effort, or with --preset published the most epochs, that should take "
+    "no longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the "
+    "most that may be chosen.",
 )
 @click.option(
     "--part",
@@ -153,24 +150,21 @@ def command(
     --var u,v,w or --var all encodes several variables into one file, each with its own promise if
     wished: --max-error u=0.1,v=0.2.
 
-    Ctrl-C leaves no file, and an older RUN.fhz as it was. With --profile paper it saves a
+    Ctrl-C leaves no file, and an older RUN.fhz as it was. With --preset published it saves a
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
-    profile compact the same command starts again.
+    others the same command starts again.
     """
     time_budget, report_folder = options.time_budget, options.report_folder
     explain, as_json, quiet = options.explain, options.as_json, options.quiet
-    auto = settings["profile"] == "auto"
-    others = explain or auto or time_budget is not None or report_folder is not None
+    others = explain or time_budget is not None or report_folder is not None
     wish = WishedPart.of(options.part, options.plan, with_others=others)
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     several = variables_to_encode(source, data, options.components, quiet=quiet)
     if several is not None:
         alone = (time_budget, report_folder, wish, options.verbose or None)
-        if auto or any(given is not None for given in alone):
-            raise click.UsageError(
-                "--profile auto, --time-budget, --report, --part and -v are for one variable"
-            )
+        if any(given is not None for given in alone):
+            raise click.UsageError("--time-budget, --report, --part and -v are for one variable")
         encoded = _encode_several(data, output, several, settings, force, quiet)
         return _emit_several(encoded, explain, as_json)
     config = config_of(settings)
@@ -180,8 +174,10 @@ def command(
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed: QualityError | None = None
         stopped: InterruptedEncodingError | None = None
-        config, model, choice = _settled(series, config, time_budget, progress, quiet=quiet)
-        predicted = None if choice is None else dataclasses.asdict(choice.prediction)
+        choice = predicted = None
+        if time_budget is not None:
+            choice = _choose(series, config, time_budget, progress, quiet=quiet)
+            config, predicted = choice.config, dataclasses.asdict(choice.prediction)
         try:
             report = encode_all_or_part(series, output, config, wish, force, progress, predicted)
         except QualityError as error:
@@ -200,9 +196,6 @@ def command(
         rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows) + _explained(report, explain)
     chosen: Chosen = {}
-    if model is not None:
-        chosen["models"] = model.to_dict()
-        text += f"\n\n{model_table(model)}" if model.prices else ""
     if choice is not None:
         chosen["time_budget"] = choice.to_dict()
     return emit({**report, **chosen}, text, as_json, missed or stopped)
@@ -290,32 +283,13 @@ def _emit_several(
     emit(report, text, as_json, missed)
 
 
-def _settled(
-    series: Series,
-    config: EncodeConfig,
-    time_budget: float | None,
-    progress: Progress,
-    *,
-    quiet: bool,
-) -> tuple[EncodeConfig, ModelChoice | None, Choice | None]:
-    """The settings, and how the model, and effort or epochs, were chosen where they were left."""
-    model = choice = None
-    if config.profile == "auto":
-        model = _choose_model(series, config, time_budget, progress, quiet=quiet)
-        config = model.config
-    if time_budget is not None:
-        choice = _choose(series, config, time_budget, progress, quiet=quiet)
-        config = choice.config
-    return config, model, choice
-
-
 def _choose(
     series: Series, config: EncodeConfig, seconds: float, progress: Progress, *, quiet: bool
 ) -> Choice:
     """Choose effort or epochs by a budget in seconds, and say so in one line."""
     from fhash_codec.cost.prediction import choose
 
-    name = "epochs" if config.profile == "paper" else "effort"
+    name = "epochs" if config.published else "effort"
     given = click.get_current_context().get_parameter_source(name)
     choice = choose(
         series,
@@ -329,48 +303,6 @@ def _choose(
     elif not quiet:
         say(choice.why)
     return choice
-
-
-def _choose_model(
-    series: Series,
-    config: EncodeConfig,
-    seconds: float | None,
-    progress: Progress,
-    *,
-    quiet: bool,
-) -> ModelChoice:
-    """Choose the model by fits to a crop, and say so in one line."""
-    from fhash_codec.config import MODELS
-    from fhash_codec.cost.encodings import choose_model
-
-    budget = math.inf if seconds is None else seconds
-    choice = choose_model(series, config, budget=budget, progress=progress)
-    if not quiet:
-        say(f"{MODELS[choice.config.profile]}: {choice.why}")
-    return choice
-
-
-def model_table(choice: ModelChoice) -> str:
-    """Table of what each model costs, and which was taken."""
-    from fhash_codec.config import MODELS
-
-    rows = [["model", "size", "encoding", "region", "picture", "PSNR", "between steps", ""]]
-    for price in choice.prices:
-        taken = price.profile == choice.config.profile
-        why = f"taken: {choice.why}" if taken else "" if price.kept else "misses the promise"
-        rows.append(
-            [
-                MODELS[price.profile],
-                f"about {size(price.bytes)}",
-                duration(price.seconds),
-                f"{price.region_ms:.3g} ms",
-                f"{price.picture_ms:.3g} ms",
-                number(price.psnr, "dB"),
-                number(price.between, "dB"),
-                why,
-            ]
-        )
-    return f"{table(rows)}\nfrom {choice.crop}"
 
 
 def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
@@ -442,12 +374,10 @@ def report_rows(
     part: whether options chose a part of the source.
     verbose: whether the table has the size after each stage of the search.
     """
-    from fhash_codec.config import MODELS
-
-    paper = report["profile"] == "paper"
-    model = (
+    published = report["published"]
+    size_of_model = (
         f"{report['parameters']:,} parameters, {report['epochs']} epochs"
-        if paper
+        if published
         else f"{report['parameters']:,} numbers that are not zero"
     )
     return [
@@ -456,21 +386,21 @@ def report_rows(
         split_row(report),
         *(gain_rows(report) if verbose else ()),
         ("steps, z, y, x", extent(report["shape"])),
-        *([("key frames", str(len(report["key_frames"])))] if paper else []),
+        *([("key frames", str(len(report["key_frames"])))] if published else []),
         (
             "coreset",
             f"{report['coreset_fraction']:.3%} of the domain,"
             f" in {spans(report['feature_bounding_box'])}",
         ),
         *quality_rows(report, units),
-        ("model", f"{MODELS[report['profile']]}, {model}, profile {report['profile']}"),
+        ("model", f"{model_name(published=published)}, {size_of_model}"),
         *loss_rows(report),
         ("time", f"{duration(report['seconds'])} of wall time, on {report['device']}"),
     ]
 
 
 def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The size after each stage of a compact encoding, and when the stage was done.
+    """The size after each stage of an encoding, and when the stage was done.
 
     All but the last are estimated from a sample.
     """

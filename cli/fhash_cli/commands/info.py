@@ -20,6 +20,7 @@ from fhash_cli.output import (
     extent,
     listed,
     loss_rows,
+    model_name,
     number,
     one_line,
     quality_rows,
@@ -81,7 +82,7 @@ def _config(
     changed = [
         f"{name} {_shown(value)}"
         for name, value in config.items()
-        if name == "profile" or name not in usual or value != usual[name]
+        if name == "preset" or name not in usual or value != usual[name]
     ]
     text = ", ".join(changed)
     rows = [("config", f"{part['settings']} settings; {text}; {_stored_as(part)}")]
@@ -397,8 +398,6 @@ def _is_run(path: str) -> bool:
 
 
 def _rows(volume: Volume, info: VolumeInfo) -> list[tuple[str, str]]:
-    from fhash_codec.config import MODELS
-
     dtype = info["variable"]["dtype"]
     return [
         (
@@ -432,7 +431,7 @@ def _rows(volume: Volume, info: VolumeInfo) -> list[tuple[str, str]]:
             "key frames",
             f"{len(info['key_frames'])}: {listed([str(step) for step in info['key_frames']])}",
         ),
-        ("model", f"{MODELS[volume.profile]}, profile {volume.profile}"),
+        ("model", model_name(published=volume.profile == "paper")),
         *(_compact(volume, info) if volume.profile == "compact" else loss_rows(info["model"])),
         ("training", _training(info)),
         *_predicted(info),

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from fhash_formats.series import Series
 
 PLANNED = (
-    "features", "dilation", "max_error", "max_error_rel", "effort", "tile", "access", "without",
+    "features", "dilation", "max_error", "max_error_rel", "preset", "effort", "tile", "without",
     "seed",
 )  # fmt: skip
-"""Settings of a plan: of the profile compact, and a bound as the promise."""
+"""Settings of a plan, and a bound as the promise."""
 
 
 class PlanReport(TypedDict):
@@ -151,9 +151,7 @@ class WishedPart(NamedTuple):
         if text is None and plan is not None:
             raise click.UsageError("--plan goes with --part")
         if text is not None and with_others:
-            raise click.UsageError(
-                "--part goes without --explain, --time-budget, --report and --profile auto"
-            )
+            raise click.UsageError("--part goes without --explain, --time-budget and --report")
         return None if text is None else cls(text, plan)
 
 

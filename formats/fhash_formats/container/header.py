@@ -341,7 +341,6 @@ Change = Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]]
 """An object and its defaults to the object with or without them."""
 
 CONFIG_DEFAULTS: dict[str, Any] = {
-    "access": "balanced",
     "batch": 0,
     "brick": "auto",
     "device": "auto",
@@ -357,7 +356,7 @@ CONFIG_DEFAULTS: dict[str, Any] = {
     "learning_rate": 0.01,
     "max_error": None,
     "max_error_rel": None,
-    "profile": "compact",
+    "preset": "default",
     "psnr": None,
     "psnr_bulk": None,
     "ratio": None,
@@ -372,6 +371,8 @@ CONFIG_DEFAULTS: dict[str, Any] = {
     "without": [],
 }
 """Values of the settings that a header leaves out."""
+BEFORE_PRESETS = ("profile", "access")
+"""Settings that stood in place of `preset`."""
 DEFAULTS: dict[str, Any] = {
     "features": ["all"],
     "dilation": 1,
@@ -693,8 +694,22 @@ def brief(header: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def complete(header: Mapping[str, Any]) -> dict[str, Any]:
-    """A header with all that was left out; what is there stays, of whatever form it is."""
+    """A header with all that was left out; what is there stays, of whatever form it is.
+
+    Settings of the profile and the access, which older encoders had, become the preset.
+    """
+    config = header.get("config")
+    if isinstance(config, dict) and not config.keys().isdisjoint(BEFORE_PRESETS):
+        header = {**header, "config": _with_preset(config)}
     return _changed(_with, header)
+
+
+def _with_preset(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of an older encoder with the preset that they amount to."""
+    profile, access = (config.get(key) for key in BEFORE_PRESETS)
+    wish = access if access in ("fast", "small") else "default"
+    kept = {key: value for key, value in config.items() if key not in BEFORE_PRESETS}
+    return kept | {"preset": "published" if profile == PAPER else wish}
 
 
 def _changed(change: Change, header: Mapping[str, Any]) -> dict[str, Any]:

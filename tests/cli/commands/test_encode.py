@@ -16,7 +16,7 @@ import fhash_codec
 from fhash_cli.output import Progress
 
 SMALL = ["--effort", "1", "--quiet"]
-PAPER = ["--profile=paper", "--tables=float16", "--epochs", "2", "--width", "4", "--quiet"]
+PAPER = ["--preset=published", "--tables=float16", "--epochs", "2", "--width", "4", "--quiet"]
 
 
 def test_what_each_stage_bought_is_in_the_table_and_in_json(
@@ -24,7 +24,7 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
 ) -> None:
     words = ["encode", data, "-o", tmp_path / "run.fhz", "--effort", "2", "--force", "-q"]
     report = json.loads(fhash(*words, "--json").stdout)
-    assert report["profile"] == "compact"
+    assert report["published"] is False
     assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(
         report["gains"]
     )
@@ -44,7 +44,7 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
     [["--max-error", "0.125"], ["--max-error-rel", "0.01"], ["--tile", "2x4x4x4", "--psnr", "35"]],
     ids=str,
 )
-def test_promises_of_the_compact_profile_are_kept(
+def test_promises_of_the_default_preset_are_kept(
     fhash: Fhash, data: Path, tmp_path: Path, words: list[str]
 ) -> None:
     report = json.loads(
@@ -127,7 +127,7 @@ def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_b
 
 @pytest.mark.parametrize("stage", ["scanning", "planning", "coding", "measuring"])
 @pytest.mark.parametrize("older", [False, True])
-def test_ctrl_c_says_that_the_profile_compact_starts_again(
+def test_ctrl_c_says_that_the_default_preset_starts_again(
     fhash: Fhash,
     data: Path,
     tmp_path: Path,
@@ -210,23 +210,6 @@ def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
     encoder = json.loads(fhash("info", run, "--json").stdout)["encoder"]
     assert set(encoder["predicted"]) == {"seconds", "bytes", "psnr"}
     assert encoder["took_seconds"] > 0
-
-
-def test_auto_says_what_both_models_cost(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    words = ("encode", data, "-o", tmp_path / "run.fhz", "--profile", "auto", "--psnr", "30")
-    result = fhash(*words, "--effort", "1")
-    assert result.exit_code == 0
-    assert "fhash: lattice: the fewest bytes, --access balanced" in result.stderr
-    lines = result.stdout.splitlines()
-    assert any(line.startswith("network (F-Hash)  about") for line in lines)
-    assert sum("taken: " in line for line in lines) == 1
-    report = json.loads(fhash(*words, "--effort", "1", "--force", "--json", "-q").stdout)
-    assert report["models"]["chosen"] == report["profile"]
-    assert (
-        fhash("encode", data, "-o", tmp_path / "x.fhz", *words[4:], "--var", "all").exit_code == 2
-    )
-    with pytest.raises(fhash_codec.InputError, match="choose_model"):
-        fhash_codec.encode(data, tmp_path / "x.fhz", fhash_codec.EncodeConfig(profile="auto"))
 
 
 BOUNDED = ["--max-error", "0.01", "--tile", "1x6x7x8", "--effort", "1", "-q"]

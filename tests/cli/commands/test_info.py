@@ -121,7 +121,7 @@ def test_a_listing_is_for_one_screen() -> None:
     assert "not to be encoded: w0 (2,), w1 (2,)" in text
 
 
-PAPER = ["--profile=paper", "--tables=float16", "--epochs", "1", "--width", "4", "--quiet"]
+PAPER = ["--preset=published", "--tables=float16", "--epochs", "1", "--width", "4", "--quiet"]
 
 
 def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
@@ -134,26 +134,26 @@ def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
         "time 0 to 4",
         "x 10 to 3",
         "interval:4:99",
-        "compact",
+        "F-Hash",
     ):
         assert text in result.stdout
 
 
-def test_info_of_a_paper_file_says_how_it_was_trained(
+def test_info_of_the_published_network_says_how_it_was_trained(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
     assert fhash("encode", data, "-o", tmp_path / "run.fhz", *PAPER).exit_code == 0
     result = fhash("info", tmp_path / "run.fhz")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert "paper" in result.stdout
+    assert "F-Hash, the published network" in result.stdout
     assert "1 epochs" in result.stdout
 
 
 @pytest.mark.filterwarnings("ignore:training diverged")
 def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     wild = [
-        "--profile",
-        "paper",
+        "--preset",
+        "published",
         "--tables",
         "float16",
         "--epochs",

@@ -224,7 +224,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """One encoding, no pictures, and a PNG that is quick to draw."""
     from fhash_codec.config import EncodeConfig
 
-    wish = Wish(codec="compact", group="g", config=EncodeConfig(effort=1, psnr=40.0))
+    wish = Wish(codec="default", group="g", config=EncodeConfig(effort=1, psnr=40.0))
     prediction = Prediction(seconds=0.01, bytes=9, psnr=40.0, basis="")
     monkeypatch.setattr(cost, "wishes", lambda features: iter([wish]))
     training = SimpleNamespace(

@@ -371,7 +371,7 @@ def test_a_plan_comes_back_from_its_file(plan) -> None:
     read.require(series())
 
 
-@pytest.mark.parametrize("promise", [{"psnr": 40}, {"ratio": 9}, {}, {"profile": "paper"}])
+@pytest.mark.parametrize("promise", [{"psnr": 40}, {"ratio": 9}, {}, {"preset": "published"}])
 def test_only_a_bound_is_planned(tmp_path, promise) -> None:
     with pytest.raises(InputError, match="give max_error or max_error_rel"):
         plan_parts(series(), tmp_path / "a.plan", EncodeConfig(**promise))
@@ -643,7 +643,7 @@ def test_what_other_machines_cannot_read_is_refused(tmp_path, threads) -> None:
     ):
         with pytest.raises(InputError, match=message):
             fhash_codec.encode(source, output, settings_cluster(), client=threads, **options)
-    for promise in ({"psnr": 40}, {"ratio": 10}, {}, {"profile": "paper"}):
+    for promise in ({"psnr": 40}, {"ratio": 10}, {}, {"preset": "published"}):
         with pytest.raises(InputError, match="give max_error or max_error_rel"):
             fhash_codec.encode(
                 tmp_path / "data.npy", output, EncodeConfig(**promise), client=threads

@@ -458,7 +458,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
         ({"config": EncodeConfig(psnr=40)}, "a PSNR or a ratio depends"),
         ({"max_error_rel": 0.01}, "give value_range"),
         ({"config": EncodeConfig(max_error=1, features=("interval:0:1",))}, "keeps everything"),
-        ({"config": EncodeConfig(profile="paper", tables="float16")}, "profile 'paper'"),
+        ({"config": EncodeConfig(preset="published", tables="float16")}, "preset 'published'"),
         ({"max_error": 1, "shape": (4, 10)}, "three lengths"),
         ({"max_error": 1, "path": "run.nc"}, "a container is not a .nc file"),
     ],

@@ -38,7 +38,7 @@ from fhash_codec.compact.planner import block_of, column_of, sheet_of
 from fhash_codec.compact.tiles import Coding, Outcome, recoded
 from fhash_codec.compact.transform import usual_transform
 from fhash_codec.compact.trials import plan_by_prices
-from fhash_codec.config import ACCESSES
+from fhash_codec.config import ACCESS
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
@@ -450,8 +450,8 @@ def test_where_no_step_fits_the_best_table_below_is_taken() -> None:
     ("options", "keys"),
     [
         ({"effort": 2}, {"price", "tried"}),
-        ({"effort": 2, "access": "fast"}, {"price", "tried"}),
-        ({"effort": 1, "access": "fast", "timings": False}, set()),
+        ({"effort": 2, "preset": "fast"}, {"price", "tried"}),
+        ({"effort": 1, "preset": "fast", "timings": False}, set()),
         ({"effort": 2, "tile": "whole", "timings": False}, set()),
     ],
 )
@@ -470,7 +470,7 @@ def test_a_header_says_what_the_tiles_cost(
         assert record.keys() - {"coder"} == keys
         assert record.get("coder", "fast") == "fast"
     if "price" in record:
-        assert 1 <= record["price"] <= access.PRICES[options.get("access", "balanced")]
+        assert 1 <= record["price"] <= access.PRICES[ACCESS[options.get("preset", "default")]]
         assert record["tried"] >= 1
 
 
@@ -569,13 +569,13 @@ def test_a_large_series_has_long_tiles_where_steps_are_alike(
 def test_faster_wishes_have_faster_regions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
     works = []
-    for wish in ACCESSES:
+    for preset in ("fast", "default", "small"):
         with ThreadPoolExecutor(2) as workers:
-            task = plan_task(waves((8, 16, 48, 48)), workers, psnr=40.0, access=wish)
+            task = plan_task(waves((8, 16, 48, 48)), workers, psnr=40.0, preset=preset)
             attempt = plan_by_prices(task, first_settings(task, task.blocks))
         assert attempt.tiling is not None
         assert attempt.tiling.price is not None
-        assert attempt.tiling.price <= access.PRICES[wish]
+        assert attempt.tiling.price <= access.PRICES[ACCESS[preset]]
         works.append(access.region_vertices(task.blocks.shape, attempt.tiling.tile))
     assert works == sorted(works)
 

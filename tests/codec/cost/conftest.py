@@ -35,7 +35,7 @@ def series() -> ArraySeries:
 def report() -> CostReport:
     """A report with measured and predicted encodings, reads, pictures, and what was left out."""
     point = Encoded(
-        name="effort 1, 40 dB", codec="compact", group="effort 1",
+        name="effort 1, 40 dB", codec="default", group="effort 1",
         options="--effort 1 --psnr 40", seconds=0.5, bytes=1000, ratio=20.0, psnr=40.1,
         psnr_bulk=38.0, max_abs_error=0.1, predicted_seconds=0.4, predicted_bytes=1100,
         predicted_psnr=40.0, basis="a part", region_ms=3.0,
@@ -49,7 +49,7 @@ def report() -> CostReport:
         predicted_seconds=None,
     )  # fmt: skip
     predicted = Encoded(
-        name="effort 5, 50 dB", codec="compact", group="effort 5",
+        name="effort 5, 50 dB", codec="default", group="effort 5",
         predicted_seconds=9.0, predicted_bytes=900, predicted_psnr=50.0,
     )  # fmt: skip
     counters = complete({"rays": 4})
@@ -58,7 +58,7 @@ def report() -> CostReport:
         measured="the whole series", measured_shape=(4, 6, 10, 12), raw_bytes=11520,
         value_range=(0.0, 1.0), budget_seconds=120.0, seconds=3.0, interrupted=False,
         encodings=(usual, point, other, predicted),
-        curves=(Curve(name="paper, 2 epochs", points=(
+        curves=(Curve(name="published network, 2 epochs", points=(
             {"seconds": 1.0, "epoch": 1, "psnr": 20.0},
             {"seconds": 2.0, "epoch": 2, "psnr": None},
         )),),

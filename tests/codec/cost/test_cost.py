@@ -17,7 +17,7 @@ from fhash_codec.cost.cost import measure_cost, report_on_encode
 from fhash_codec.cost.encodings import KeptFile
 from fhash_codec.cost.plan import Allowance, Wish, facts_of
 from fhash_codec.cost.prediction import Prediction
-from fhash_codec.cost.results import Picture, advice_rows, feature_options
+from fhash_codec.cost.results import NETWORK, Picture, advice_rows, feature_options
 from fhash_codec.cost.uses import (
     NOTHING,
     PictureCosts,
@@ -37,7 +37,7 @@ def few(features: tuple[str, ...]) -> Iterator[Wish]:
     """Two encodings and a peer."""
     for effort in (1, 2):
         config = EncodeConfig(effort=effort, psnr=40.0, features=features)
-        yield Wish(codec="compact", group=f"effort {effort}", config=config)
+        yield Wish(codec="default", group=f"effort {effort}", config=config)
     yield Wish(codec="SZ3", group="SZ3", target=40.0)
 
 
@@ -66,7 +66,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_encodings_reads_and_advice(series: ArraySeries) -> None:
     report = measure_cost(series, budget=500.0)
-    assert [point.codec for point in report.encodings] == ["compact", "compact", "SZ3"]
+    assert [point.codec for point in report.encodings] == ["default", "default", "SZ3"]
     assert all(point.measured for point in report.encodings)
     assert {read.what for read in report.reads} >= {"open", "frame", "line in time"}
     assert report.measured == "the whole series"
@@ -91,7 +91,7 @@ def test_a_series_that_is_too_large_is_cropped(
 def test_features_are_those_of_every_encoding(series: ArraySeries) -> None:
     report = measure_cost(series, features=("interval:1:9",), budget=500.0)
     assert report.features == ("interval:1:9",)
-    own = [point for point in report.encodings if point.codec == "compact"]
+    own = [point for point in report.encodings if point.codec == "default"]
     assert all("--feature interval:1:9" in point.options for point in own)
     assert feature_options(report) == ["--feature interval:1:9"]
     assert {row[-1] for row in advice_rows(report)} <= {
@@ -176,8 +176,8 @@ def test_every_group_is_measured(series: ArraySeries, tmp_path: Path) -> None:
         encode(series, path, EncodeConfig(effort=1, psnr=psnr))
         files.append(KeptFile(name=name, path=path, psnr=psnr))
     network = tmp_path / "network.fhz"
-    encode(series, network, EncodeConfig(profile="paper", tables="float16", epochs=1, width=4))
-    files.append(KeptFile(name="network", path=network, psnr=20.0))
+    encode(series, network, EncodeConfig(preset="published", tables="float16", epochs=1, width=4))
+    files.append(KeptFile(name=NETWORK, path=network, psnr=20.0))
     made: list[Picture] = []
     allowance = Allowance(1000.0)
     with open_volume(files[0].path) as volume:
@@ -201,7 +201,7 @@ def test_every_group_is_measured(series: ArraySeries, tmp_path: Path) -> None:
     (arm,) = [
         each
         for each in made
-        if each.group.startswith("march, paper, ") and each.setting == "ARM on"
+        if each.group.startswith(f"march, {NETWORK}, ") and each.setting == "ARM on"
     ]
     assert arm.counters["evaluations"] > 0
     assert {"level of detail", "threshold", "level of detail, first picture"} <= {

@@ -98,12 +98,12 @@ PROBE = PaperProbe(
 def test_each_step_and_each_point_of_the_curve_is_counted(
     epochs: int, points: int, steps: int
 ) -> None:
-    config = EncodeConfig(profile="paper", tables="float16", epochs=epochs)
+    config = EncodeConfig(preset="published", tables="float16", epochs=epochs)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * steps + 0.25 * points
 
 
 def test_a_batch_of_another_size_makes_other_steps() -> None:
-    config = EncodeConfig(profile="paper", tables="float16", epochs=10, batch=10_000)
+    config = EncodeConfig(preset="published", tables="float16", epochs=10, batch=10_000)
     assert sum(PROBE.stage_seconds(config).values()) == 3 + 0.5 * 100 + 0.25 * 10
 
 
@@ -139,7 +139,7 @@ def made(values: npt.NDArray[np.generic], folder: Path, **settings: object) -> E
 def encoded_by(cost: Callable[[int, int], Mapping[str, float]]) -> Callable[..., Any]:
     """An encoder that counts its work as seconds: by vertices and effort, of each stage."""
 
-    def encode(series: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
+    def encode(series: Series, path: Path, config: EncodeConfig) -> dict[str, Any]:
         vertices = prod(series.shape)
         stages = [
             {"stage": name, "seconds": seconds, "times": 1}
@@ -152,7 +152,7 @@ def encoded_by(cost: Callable[[int, int], Mapping[str, float]]) -> Callable[...,
             "split": {"field": size, "model": 100, "index": 400},
             "psnr": 50.0,
             "rmse": 0.1,
-        }, True
+        }
 
     return encode
 
@@ -270,9 +270,9 @@ def test_a_series_that_takes_no_time_is_encoded(
 def test_each_setting_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     encoder, asked = encoded_by(counted), []
 
-    def noted(series: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
+    def noted(series: Series, path: Path, config: EncodeConfig) -> dict[str, Any]:
         asked.append(config.effort)
-        result: tuple[dict[str, Any], bool] = encoder(series, path, config)
+        result: dict[str, Any] = encoder(series, path, config)
         return result
 
     monkeypatch.setattr(probes, "reported", noted)
@@ -320,14 +320,14 @@ def test_of_large_frames_a_crop_is_encoded(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 SERIES_PREDICTION = ArraySeries(np.zeros((1, 2, 2, 2), np.float32))
-PAPER = EncodeConfig(profile="paper", tables="float16")
+PAPER = EncodeConfig(preset="published", tables="float16")
 
 
 class _Known:
     """A predictor: the square of the effort, or a second an epoch and 100 besides."""
 
     def predict(self, config: EncodeConfig) -> Prediction:
-        paper = config.profile == "paper"
+        paper = config.published
         seconds = 100.0 + config.epochs if paper else 10.0 * config.effort**2
         return Prediction(seconds=seconds, bytes=1234, psnr=50.0, basis="known")
 
@@ -381,7 +381,7 @@ def test_the_most_epochs_that_fit_are_chosen(seconds: float, epochs: int, fits: 
 
 @pytest.mark.usefixtures("known")
 def test_epochs_that_are_given_are_the_most() -> None:
-    config = EncodeConfig(profile="paper", tables="float16", epochs=30)
+    config = EncodeConfig(preset="published", tables="float16", epochs=30)
     assert choose(SERIES_PREDICTION, config, 10_000, capped=True).config.epochs == 30
 
 
@@ -514,7 +514,7 @@ def test_errors_count_in_the_features_alone(series: ArraySeries, tmp_path: Path)
 
 def test_the_default_and_the_network_come_first_and_every_name_once() -> None:
     every = list(wishes())
-    assert [wish.config for wish in every[:2]] == [EncodeConfig(), EncodeConfig(profile="paper")]
+    assert [wish.config for wish in every[:2]] == [EncodeConfig(), EncodeConfig(preset="published")]
     assert [wish.always for wish in every] == [True, True, *[False] * (len(every) - 2)]
     assert [wish.codec for wish in every[3:6]] == list(PEERS)
     names = [wish.name for wish in every]
@@ -523,7 +523,7 @@ def test_the_default_and_the_network_come_first_and_every_name_once() -> None:
 
 def test_options_give_the_encoding_again() -> None:
     config = EncodeConfig(effort=3, psnr=45.0)
-    wish = Wish(codec="compact", group="effort 3", config=config)
+    wish = Wish(codec="default", group="effort 3", config=config)
     assert options_of(config) == "--psnr 45 --effort 3"
     assert wish.name == "effort 3, 45 dB"
     assert options_of(EncodeConfig()) == ""
@@ -532,7 +532,7 @@ def test_options_give_the_encoding_again() -> None:
     assert network.config is not None
     assert (
         options_of(network.config)
-        == "--profile network --feature 'mask:a b.npy' --feature isosurface:5"
+        == "--preset published --feature 'mask:a b.npy' --feature isosurface:5"
     )
     assert options_of(EncodeConfig(timings=False)) == "--no-timings"
 
@@ -545,13 +545,13 @@ def point(name: str, codec: str, seconds: float | None, size: int, psnr: float |
 
 
 POINTS = [
-    point("fast", "compact", 1.0, 2000, 46.0),
-    point("faster", "compact", 0.9, 9900, 51.0),
-    point("small", "compact", 9.0, 1000, 45.0),
-    point("as small", "compact", 8.0, 1005, 45.0),
+    point("fast", "default", 1.0, 2000, 46.0),
+    point("faster", "default", 0.9, 9900, 51.0),
+    point("small", "default", 9.0, 1000, 45.0),
+    point("as small", "default", 8.0, 1005, 45.0),
     point("peer", "SZ3", 0.1, 300, 46.0),
-    point(DEFAULT, "compact", 5.0, 9000, 61.0),
-    point("only predicted", "compact", None, 1, 99.0),
+    point(DEFAULT, "default", 5.0, 9000, 61.0),
+    point("only predicted", "default", None, 1, 99.0),
 ]
 
 
@@ -584,7 +584,7 @@ def test_a_largest_error_must_be_promised() -> None:
 
 
 def test_exact_values_reach_every_accuracy() -> None:
-    entries = advise([point("exact", "compact", 2.0, 5000, None)], 10.0)
+    entries = advise([point("exact", "default", 2.0, 5000, None)], 10.0)
     goals = {entry.goal for entry in entries}
     assert goals == {"40 dB", "45 dB", "50 dB", "60 dB", "within 1 %", "within 0.1 %"}
     assert {(entry.psnr, entry.max_error_rel) for entry in entries} >= {(40.0, None), (None, 0.01)}
@@ -703,7 +703,7 @@ def test_without_time_or_package_they_are_left_out(
     assert "fhash[bench]" in entry.why
 
 
-FAST = Wish(codec="compact", group="effort 1", config=EncodeConfig(effort=1, psnr=40.0))
+FAST = Wish(codec="default", group="effort 1", config=EncodeConfig(effort=1, psnr=40.0))
 
 
 def foretold(config: EncodeConfig) -> Prediction:
@@ -774,75 +774,3 @@ def test_ctrl_c_in_a_training_ends_the_measurements(
     allowance = Allowance(1000.0)
     OwnEncodings(series, tmp_path, allowance, foretold, silent).measure(FAST)
     assert allowance.interrupted
-
-
-PRICE = own.ModelPrice(
-    profile="compact",
-    bytes=1000,
-    seconds=10.0,
-    region_ms=9.0,
-    picture_ms=1.0,
-    psnr=45.0,
-    between=40.0,
-    kept=True,
-)
-
-
-@pytest.mark.parametrize(
-    ("other", "access", "budget", "chosen", "why"),
-    [
-        ({"bytes": 1090, "region_ms": 3.0}, "balanced", 60, "paper", "1.09 times the bytes"),
-        ({"bytes": 1090, "region_ms": 3.0}, "small", 60, "compact", "the fewest bytes"),
-        ({"bytes": 1400, "region_ms": 3.0}, "balanced", 60, "compact", "the fewest bytes"),
-        ({"bytes": 1400, "region_ms": 3.0}, "fast", 60, "paper", "1.40 times"),
-        ({"bytes": 900, "kept": False}, "small", 60, "compact", "does not keep the promise"),
-        ({"bytes": 5000, "seconds": 4.0}, "small", 5, "paper", "longer than 5 s"),
-        ({"bytes": 500, "seconds": 20.0}, "small", 5, "compact", "too few for either"),
-    ],
-)
-def test_the_access_and_the_budget_choose_the_model(
-    other: dict[str, Any], access: str, budget: float, chosen: str, why: str
-) -> None:
-    price, text = own._cheapest([PRICE, replace(PRICE, profile="paper", **other)], access, budget)
-    assert price.profile == chosen
-    assert why in text
-
-
-def test_both_models_are_fitted_to_a_crop(monkeypatch: pytest.MonkeyPatch) -> None:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in (6, 12, 20, 20)), indexing="ij")
-    series = ArraySeries((np.sin(x * y + t) * np.exp(-z)).astype(np.float32))
-    monkeypatch.setattr(own, "CROP_VERTICES", 6 * 10**3)
-    asked = EncodeConfig(profile="auto", features=("interval:0.2:2",), psnr=34.0, effort=2)
-    choice = own.choose_model(series, asked)
-    assert choice.crop.startswith("a crop")
-    assert [price.profile for price in choice.prices] == ["compact", "paper"]
-    for price in choice.prices:
-        assert price.kept
-        assert 0 < price.bytes < series.values.nbytes
-        assert min(price.seconds, price.region_ms, price.picture_ms) > 0
-        assert 0 < (price.between or 0) < (price.psnr or 0)
-    assert choice.config == asked.of_profile(choice.config.profile)
-    assert choice.config.psnr == 34.0
-    assert choice.to_dict()["chosen"] == choice.config.profile
-    # the part has a smaller range, in which the same errors are a larger share
-    whole, part = facts_of(series, silent), facts_of(cropped(series, 6000), silent)
-    moved = own._for_part(replace(asked, psnr=60.0), whole, part)
-    assert moved.psnr == pytest.approx(60 - 20 * np.log10(whole.width / part.width))
-
-
-def test_a_crop_without_the_feature_leaves_the_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
-    values = np.random.default_rng(0).random((12, 6, 7, 8), np.float32)
-    values[11, 2, 3, 4] = 9.0
-    monkeypatch.setattr(own, "CROP_VERTICES", 1000)
-    asked = EncodeConfig(profile="auto", features=("interval:5:10",), psnr=20.0)
-    choice = own.choose_model(ArraySeries(values), asked)
-    assert (choice.config.profile, choice.prices) == ("compact", ())
-    assert "no crop of the middle steps" in choice.why
-    changing = own.choose_model(ArraySeries(values), replace(asked, features=("change:0.5",)))
-    assert len(changing.prices) == 2
-
-
-@pytest.mark.parametrize("promise", [{"ratio": 20.0}, {"max_error": 0.1}, {"max_error_rel": 0.1}])
-def test_a_ratio_or_a_bound_leaves_no_choice(promise: dict[str, float]) -> None:
-    choice = own.choose_model(SERIES, EncodeConfig(profile="auto", **promise))
-    assert (choice.config.profile, choice.prices) == ("compact", ())

@@ -67,7 +67,7 @@ def test_predictions_are_drawn_where_those_of_their_effort_held(
 
 def test_trainings_stages_and_steps(report: CostReport) -> None:
     made = {panel.key: panel for panel in encode_panels(report)}
-    assert [point.y for point in made["training"].curves["paper, 2 epochs"]] == [20.0]
+    assert [point.y for point in made["training"].curves["published network, 2 epochs"]] == [20.0]
     assert made["stages"].bars
     assert made["stages"].curves[""][0].y == "head"
     assert made["per-step"].curves[""][0].y == 40.0

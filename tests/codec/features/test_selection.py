@@ -606,7 +606,7 @@ def test_auto_looks_at_the_vertices_of_the_feature_alone() -> None:
     keys = {}
     for features in (("all",), ("interval:1:9",)):
         config = EncodeConfig(
-            profile="paper", tables="float16", key_frames="auto:4", features=features
+            preset="published", tables="float16", key_frames="auto:4", features=features
         )
         keys[features] = resolve_selection(series, config, silent, None)[1]
     assert {1, 2} < set(keys["all",])

@@ -1,4 +1,4 @@
-"""Networks, coresets and trainings of the profile paper, and the formulas that they are held to."""
+"""Published networks, their coresets and trainings, and the formulas that they are held to."""
 
 from __future__ import annotations
 
@@ -236,7 +236,7 @@ def in_coreset() -> Callable[[Coreset], npt.NDArray[np.bool_]]:
 
 
 CODED = EncodeConfig(
-    profile="paper", epochs=6, width=16, fold=2, embedding_size=2, tables="transform"
+    preset="published", epochs=6, width=16, fold=2, embedding_size=2, tables="transform"
 )
 
 

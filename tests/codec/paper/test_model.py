@@ -1,4 +1,4 @@
-"""The paper profile's model as `Volume` reads it."""
+"""The published network as `Volume` reads it."""
 
 from __future__ import annotations
 
@@ -252,7 +252,7 @@ def test_coded_tables_get_the_promise(tmp_path, monkeypatch, key_frames) -> None
         raise Reached
 
     monkeypatch.setattr("fhash_codec.paper.table_step.write_coded", write_coded)
-    config = EncodeConfig(profile="paper", epochs=1, width=8, psnr=1.0, key_frames=key_frames)
+    config = EncodeConfig(preset="published", epochs=1, width=8, psnr=1.0, key_frames=key_frames)
     field = np.random.default_rng(0).random((3, 4, 5, 6), dtype=np.float32)
     with pytest.raises(Reached):
         fhash_codec.encode(field, tmp_path / "a.fhz", config)
@@ -277,7 +277,7 @@ def test_tables_are_sparse_below_half_of_the_box(tables, share, expected) -> Non
     """The share is that of all samples, those of the fringe included."""
     box = Box.of([(1, 6), (0, 10), (2, 12)])
     coreset = Mock(box=box, key_frames=(0, 3), values=np.zeros(round(1000 * share)))
-    config = EncodeConfig(profile="paper", tables=tables)
+    config = EncodeConfig(preset="published", tables=tables)
     assert sparse_tables(coreset, config) == expected
 
 
@@ -285,7 +285,7 @@ def test_the_architecture_is_that_of_the_box_and_the_key_frames() -> None:
     field = np.zeros((6, 9, 10, 20), np.float32)
     field[:, 2:7, 3:8, 4:15] = 1.0
     config = EncodeConfig(
-        profile="paper",
+        preset="published",
         tables="float16",
         features=("interval:0.5:2",),
         dilation=0,
@@ -303,7 +303,7 @@ def test_the_architecture_is_that_of_the_box_and_the_key_frames() -> None:
     assert (architecture.embedding_size, architecture.width) == (3, 8)
 
 
-QUICK = EncodeConfig(profile="paper", tables="float16", epochs=6, width=16)
+QUICK = EncodeConfig(preset="published", tables="float16", epochs=6, width=16)
 
 
 def decoded(path) -> np.ndarray:
@@ -320,7 +320,7 @@ def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None
     fhash_codec.encode(
         source,
         tmp_path / "a.fhz",
-        EncodeConfig(profile="paper", epochs=6, width=16, tables="float32", key_frames="0,1,3"),
+        EncodeConfig(preset="published", epochs=6, width=16, tables="float32", key_frames="0,1,3"),
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         network = load_network(volume.container)
@@ -349,21 +349,23 @@ def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None
 
 
 def test_the_same_input_gives_the_same_bytes_without_timings(field, tmp_path) -> None:
-    config = EncodeConfig(profile="paper", tables="float16", epochs=3, width=16, timings=False)
+    config = EncodeConfig(preset="published", tables="float16", epochs=3, width=16, timings=False)
     for name in ("a.fhz", "b.fhz"):
         fhash_codec.encode(field(), tmp_path / name, config)
     assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
     fhash_codec.encode(
         field(),
         tmp_path / "c.fhz",
-        EncodeConfig(profile="paper", tables="float16", epochs=3, width=16, timings=False, seed=1),
+        EncodeConfig(
+            preset="published", tables="float16", epochs=3, width=16, timings=False, seed=1
+        ),
     )
     assert (tmp_path / "a.fhz").read_bytes() != (tmp_path / "c.fhz").read_bytes()
 
 
 @pytest.mark.parametrize("moment", [1, 30, 48])
 def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(field, tmp_path, moment) -> None:
-    config = EncodeConfig(profile="paper", tables="float16", epochs=3, width=16, timings=False)
+    config = EncodeConfig(preset="published", tables="float16", epochs=3, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     path = tmp_path / "run.fhz"
 
@@ -382,7 +384,12 @@ def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(field, tmp_pat
 
 
 WILD = EncodeConfig(
-    profile="paper", epochs=3, hidden_layers=2, learning_rate=1.0, tables="float32", timings=False
+    preset="published",
+    epochs=3,
+    hidden_layers=2,
+    learning_rate=1.0,
+    tables="float32",
+    timings=False,
 )
 
 
@@ -468,7 +475,7 @@ def test_values_between_key_frames_are_right_where_one_of_them_has_no_coreset(tm
     figures = {}
     for samples in ("keys", "published"):
         config = EncodeConfig(
-            profile="paper",
+            preset="published",
             tables="float16",
             features=("interval:0.75:1",),
             key_frames="0,4",

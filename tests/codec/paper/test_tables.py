@@ -327,7 +327,7 @@ def test_training_goes_on_for_a_promise(rough_waves, coded_config, tmp_path) -> 
 
 
 def test_epochs_asked_for_are_trained_and_no_more(waves, tmp_path) -> None:
-    config = EncodeConfig(profile="paper", epochs=1, width=4)
+    config = EncodeConfig(preset="published", epochs=1, width=4)
     with pytest.raises(QualityError, match=r"50 dB .*--epochs 1 ended the training") as missed:
         fhash_codec.encode(waves(), tmp_path / "a.fhz", config)
     assert missed.value.figures["epochs"] == 1
@@ -521,7 +521,9 @@ def coded_small(tmp_path_factory):
     path = tmp_path_factory.mktemp("small") / "a.fhz"
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 4, 5, 6)), indexing="ij")
     field = (100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(np.float32)
-    config = EncodeConfig(profile="paper", epochs=2, width=16, embedding_size=2, tables="transform")
+    config = EncodeConfig(
+        preset="published", epochs=2, width=16, embedding_size=2, tables="transform"
+    )
     fhash_codec.encode(field, path, config)
     return path
 
@@ -585,7 +587,7 @@ def test_needed_are_the_corners_around_samples(box, keys, fold, fringe) -> None:
 
 
 FEATURE = EncodeConfig(
-    profile="paper",
+    preset="published",
     tables="float16",
     epochs=2,
     width=8,

@@ -74,21 +74,23 @@ def test_going_on_from_a_checkpoint_ends_at_the_same_bits(setup, coreset, tmp_pa
 
 def test_a_checkpoint_belongs_to_its_coreset_and_settings(coreset, other_coreset, tmp_path) -> None:
     output = tmp_path / "run.fhz"
-    one = checkpoint_path(output, coreset, EncodeConfig(profile="paper", tables="float16"))
+    one = checkpoint_path(output, coreset, EncodeConfig(preset="published", tables="float16"))
     assert one.parent == tmp_path
     assert one == checkpoint_path(
-        output, coreset, EncodeConfig(profile="paper", psnr=50.0, tables="float32", timings=False)
+        output,
+        coreset,
+        EncodeConfig(preset="published", psnr=50.0, tables="float32", timings=False),
     )
     assert one == checkpoint_path(
-        output, coreset, EncodeConfig(profile="paper", tables="float16", device="cpu")
+        output, coreset, EncodeConfig(preset="published", tables="float16", device="cpu")
     )
-    other_bits = EncodeConfig(profile="paper", tables="float16", deterministic=True)
+    other_bits = EncodeConfig(preset="published", tables="float16", deterministic=True)
     assert one != checkpoint_path(output, coreset, other_bits)
     assert one != checkpoint_path(
-        output, coreset, EncodeConfig(profile="paper", tables="float16", epochs=3)
+        output, coreset, EncodeConfig(preset="published", tables="float16", epochs=3)
     )
     assert one != checkpoint_path(
-        output, other_coreset, EncodeConfig(profile="paper", tables="float16")
+        output, other_coreset, EncodeConfig(preset="published", tables="float16")
     )
 
 
@@ -232,7 +234,7 @@ def test_a_network_that_died_of_its_rate_is_no_result(setup, coreset, rate, says
         assert train(engine, plan, coreset, TrainingProgress())
 
 
-CONFIG = EncodeConfig(profile="paper", tables="float16", epochs=1, width=8, batch=20_000)
+CONFIG = EncodeConfig(preset="published", tables="float16", epochs=1, width=8, batch=20_000)
 
 
 @pytest.fixture
@@ -313,7 +315,7 @@ def test_a_round_has_rates_of_its_own(setup, coreset) -> None:
 def test_a_training_goes_on_to_its_goal_but_for_epochs_asked_for(
     coreset, tmp_path, monkeypatch
 ) -> None:
-    config = EncodeConfig(profile="paper", tables="float16", epochs=5, width=16)
+    config = EncodeConfig(preset="published", tables="float16", epochs=5, width=16)
     architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
     first = train_model(coreset, architecture, config, tmp_path / "a.fhz")
     goal = Goal(psnr=300.0, promised=300.0, seconds=1e6)
@@ -336,7 +338,13 @@ def test_a_training_goes_on_to_its_goal_but_for_epochs_asked_for(
 
 
 CONFIG_FIT_ON_CUDA = EncodeConfig(
-    profile="paper", tables="float16", epochs=2, width=8, batch=20_000, device="cuda", engine="slab"
+    preset="published",
+    tables="float16",
+    epochs=2,
+    width=8,
+    batch=20_000,
+    device="cuda",
+    engine="slab",
 )
 
 
@@ -403,7 +411,7 @@ def test_training_on_all_steps_is_better_between_key_frames(tmp_path: Path, tabl
     found = {}
     for samples in ("keys", "all"):
         config = EncodeConfig(
-            profile="paper",
+            preset="published",
             key_frames="every:3",
             samples=samples,
             tables=tables,

@@ -37,7 +37,7 @@ CONFIGS = {
     "compact": EncodeConfig(effort=1),
     "feature": EncodeConfig(effort=1, features=("interval:3:99",), dilation=0),
     "paper": EncodeConfig(
-        profile="paper", tables="float16", features=("interval:3:99",), epochs=15, width=16
+        preset="published", tables="float16", features=("interval:3:99",), epochs=15, width=16
     ),
 }
 

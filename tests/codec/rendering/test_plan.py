@@ -139,9 +139,12 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
             {"effects": {"shading": {"light": [0, 0, 1]}, "shadows": {"light": [0, 1, 1]}}},
             "one lamp",
         ),
-        ({"march": {"mode": "arm"}}, "march 'arm' is for a network, and .*compact, has none"),
-        ({"march": {"mode": "stream"}}, "march 'stream' is for a network"),
-        ({"march": {"device": "cuda"}}, "device 'cuda' is for a network"),
+        (
+            {"march": {"mode": "arm"}},
+            "march 'arm' is for the published network, and .* holds another model",
+        ),
+        ({"march": {"mode": "stream"}}, "march 'stream' is for the published network"),
+        ({"march": {"device": "cuda"}}, "device 'cuda' is for the published network"),
         ({"march": {"device": "gpu"}}, "allowed: auto, cpu, cuda"),
         ({"camera": {"position": [1, 1, 1], "focal_point": [1, 1, 1]}}, "are the same"),
         ({"camera": {"view_up": [0, 0, 0]}}, "no length"),
@@ -250,7 +253,7 @@ def test_auto_is_arm_on_a_cpu_where_all_samples_cost_less_than_the_frame(
     path = tmp_path / "a.fhz"
     field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
     fhash_codec.encode(
-        field, path, EncodeConfig(profile="paper", tables="float16", epochs=1, width=4)
+        field, path, EncodeConfig(preset="published", tables="float16", epochs=1, width=4)
     )
     samples = 16 * 16 * np.sqrt(4**2 + 5**2 + 6**2) / 0.5
     limit = 4 * 5 * 6 / samples
@@ -558,7 +561,7 @@ def test_a_network_is_sampled_where_uneven_axes_say(tmp_path: Path) -> None:
     axis, even = UNEVEN[::3], EVEN[::3]
     values = np.repeat(ball(even, even, axis)[None], 2, axis=0)
     config = EncodeConfig(
-        profile="paper", tables="float16", features=("interval:0.3:2",), epochs=8, width=8
+        preset="published", tables="float16", features=("interval:0.3:2",), epochs=8, width=8
     )
     path = written(tmp_path / "p.fhz", values, config, z=even, y=even, x=axis)
     scene = {"size": [12, 12], "transfer_function": LINEAR, "effects": {"shading": True}}

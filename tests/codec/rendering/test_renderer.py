@@ -90,25 +90,25 @@ def test_importing_the_package_loads_no_renderer() -> None:
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-@pytest.mark.parametrize("profile", ["compact", "network"])
+@pytest.mark.parametrize("preset", ["default", "published"])
 @pytest.mark.parametrize(
     ("full", "chosen"), [((), 0), ((2,), 2), ((4, 6), 4), ((1, 3), 0), (range(9), 0)]
 )
 def test_the_default_step_is_that_of_most_structure_of_five(
-    tmp_path: Path, full: Sequence[int], chosen: int, profile: str
+    tmp_path: Path, full: Sequence[int], chosen: int, preset: str
 ) -> None:
     """Steps 0, 2, 4, 6 and 8 are looked at; equal ones give the earliest."""
     values = np.zeros((9, 6, 7, 8), np.float32)
     for step in full:
         values[step, 2:4, 2:5, 3:6] = 1
     values[0, 0, 0, 0] = 4  # the range of the series, and hardly a sight
-    network = {"profile": "network", "tables": "float32", "epochs": 60}
-    settings = EncodeConfig(max_error=0.01) if profile == "compact" else EncodeConfig(**network)
+    network = {"preset": "published", "tables": "float32", "epochs": 60}
+    settings = EncodeConfig(max_error=0.01) if preset == "default" else EncodeConfig(**network)
     fhash_codec.encode(values, tmp_path / "run.fhz", settings)
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
         plan = Renderer(volume).plan(Scene(size=(20, 20)))
         assert plan.step == plan.scene.step
-        assert plan.step == chosen or (profile == "network" and not full)
+        assert plan.step == chosen or (preset == "published" and not full)
         surface = {"effects": {"isosurfaces": [{"value": 0.5}]}}
         surfaces = Scene.from_dict({**surface, "transfer_function": {"nothing": True}})
         assert Renderer(volume).plan(surfaces).step == chosen or not full

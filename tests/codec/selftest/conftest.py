@@ -21,7 +21,7 @@ CASE = Case(
     make=lambda: series(waves().astype(np.float32)),
     settings={"bound": EncodeConfig(max_error_rel=0.01, effort=1, timings=False)},
 )
-PAPER = EncodeConfig(profile="paper", tables="float16", width=4, epochs=2, timings=False)
+PAPER = EncodeConfig(preset="published", tables="float16", width=4, epochs=2, timings=False)
 
 
 @pytest.fixture(scope="session")
@@ -32,26 +32,26 @@ def easy() -> Case:
 
 @pytest.fixture(scope="session")
 def compact_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    """The easy case, encoded with profile compact."""
-    yield from _run("compact", tmp_path_factory)
+    """The easy case, encoded with the default preset."""
+    yield from _run("default", tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
 def paper_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    """The easy case, encoded with profile paper."""
-    yield from _run("paper", tmp_path_factory)
+    """The easy case, encoded with the preset published."""
+    yield from _run("published", tmp_path_factory)
 
 
 @pytest.fixture(scope="session", params=["compact", "paper"])
 def run(request: pytest.FixtureRequest) -> Run:
-    """The easy case, encoded with either profile."""
+    """The easy case, encoded with either preset."""
     chosen: Run = request.getfixturevalue(f"{request.param}_run")
     return chosen
 
 
-def _run(profile: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    folder = tmp_path_factory.mktemp(profile)
-    config = CASE.settings["bound"] if profile == "compact" else PAPER
+def _run(preset: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    folder = tmp_path_factory.mktemp(preset)
+    config = CASE.settings["bound"] if preset == "default" else PAPER
     source = CASE.make()
     encode(source, folder / "case.fhz", config)
     with fhash_codec.open(folder / "case.fhz") as volume:
@@ -59,7 +59,7 @@ def _run(profile: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run
             case=CASE,
             series=source,
             values=np.stack(list(source.frames())),
-            under=profile,
+            under=preset,
             config=config,
             folder=folder,
             path=folder / "case.fhz",

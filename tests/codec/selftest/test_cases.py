@@ -29,7 +29,7 @@ from fhash_codec.selftest.field_cases import (
     COMPACT,
     EXACT,
     MORE,
-    PAPER,
+    PUBLISHED,
     QUICK,
     lattice,
     noise,
@@ -286,7 +286,7 @@ def test_every_size_of_a_network_is_tried(name: str, field: str, sizes: set[floa
 def test_networks_are_trained_on_the_cpu() -> None:
     for case in network_cases.NETWORK_CASES:
         for config in (*case.settings.values(), *case.more.values()):
-            assert (config.profile, config.device) == ("paper", "cpu")
+            assert (config.preset, config.device) == ("published", "cpu")
 
 
 @pytest.mark.parametrize("view", ray_cases.AXES)
@@ -319,21 +319,21 @@ def test_fields_and_series_are_made_as_asked() -> None:
     ]
 
 
-def test_the_settings_cover_profiles_promises_and_tables() -> None:
+def test_the_settings_cover_both_models_promises_and_tables() -> None:
     configs = [*QUICK.values(), *MORE.values()]
     assert not QUICK.keys() & MORE.keys()
-    assert {config.profile for config in configs} == {"compact", "paper"}
-    assert {config.tables for config in configs if config.profile == "paper"} >= {
+    assert {config.preset for config in configs} == {"default", "published"}
+    assert {config.tables for config in configs if config.published} >= {
         "float32",
         "uint8",
         "transform",
     }
-    compact = [config for config in configs if config.profile == "compact"]
+    compact = [config for config in configs if not config.published]
     assert any(config.psnr is not None for config in compact)
     assert any(config.max_error_rel is not None for config in compact)
     assert any(config.max_error == 0 for config in compact)
-    changed = of_all({**COMPACT, **EXACT, **PAPER}, dilation=3)
-    assert changed.keys() == {*COMPACT, *EXACT, *PAPER}
+    changed = of_all({**COMPACT, **EXACT, **PUBLISHED}, dilation=3)
+    assert changed.keys() == {*COMPACT, *EXACT, *PUBLISHED}
     assert {config.dilation for config in changed.values()} == {3}
     assert changed["psnr"].psnr == COMPACT["psnr"].psnr
 

@@ -447,9 +447,9 @@ def test_several_variables_come_into_one_store(tmp_path: Path) -> None:
         fhash_codec.unpack(run, tmp_path / "two.zarr", variables=["x"])
 
 
-def test_the_profile_paper_is_refused(tmp_path: Path) -> None:
+def test_the_published_network_is_refused(tmp_path: Path) -> None:
     golden = Path(__file__).parents[2] / "golden" / "paper-plain.fhz"
-    with pytest.raises(InputError, match=r"the profile paper.*fhash decode .* -o OUT\.zarr"):
+    with pytest.raises(InputError, match=r"the published network.*fhash decode .* -o OUT\.zarr"):
         fhash_codec.unpack(golden, tmp_path / "out.zarr")
     assert not (tmp_path / "out.zarr").exists()
 

@@ -317,7 +317,7 @@ def test_a_network_keeps_its_promise_in_every_reader(
     t, z, y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in (3, 8, 9, 10)), indexing="ij")
     values = scale * (np.sin(2 * x + t) * np.cos(y - 0.3 * t) + 0.1 * z * t)
     run = tmp_path / "run.fhz"
-    fhash_codec.encode(values, run, EncodeConfig(profile="network", psnr=psnr, width=width))
+    fhash_codec.encode(values, run, EncodeConfig(preset="published", psnr=psnr, width=width))
     readers: dict[str, np.ndarray] = {}
     with fhash_codec.open(run) as volume:
         most = rounding(volume)

@@ -535,6 +535,26 @@ def test_a_brief_header_comes_back(samples) -> None:
     assert complete(complete(short)) == before
 
 
+@pytest.mark.parametrize(
+    ("older", "preset"),
+    [
+        ({"profile": "paper"}, "published"),
+        ({"profile": "paper", "access": "fast"}, "published"),
+        ({"profile": "compact", "access": "fast"}, "fast"),
+        ({"access": "small"}, "small"),
+        ({"access": "balanced"}, "default"),
+        ({"access": ["fast"]}, "default"),
+        ({}, "default"),
+    ],
+)
+def test_settings_of_older_encoders_have_the_preset_that_they_amount_to(older, preset) -> None:
+    assert complete({"config": {"effort": 7, **older}})["config"] == {
+        **CONFIG_DEFAULTS,
+        "effort": 7,
+        "preset": preset,
+    }
+
+
 def test_a_quality_that_nobody_measured_stays_empty() -> None:
     assert complete({"quality": {}})["quality"] == {}
     assert brief({"quality": {"ssim_window": {}}}) == {"quality": {"ssim_window": {}}}

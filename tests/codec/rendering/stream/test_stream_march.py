@@ -258,7 +258,7 @@ def test_native_and_streamed_samples_of_a_network_make_one_picture(
 def test_native_samples_of_a_network_of_all_vertices(tmp_path: Path, planned: Planned) -> None:
     z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (9, 10, 11)), indexing="ij")
     values = np.sin(5 * x * y) * np.cos(3 * z)
-    config = fhash_codec.EncodeConfig(profile="paper", tables="float16", epochs=200, width=8)
+    config = fhash_codec.EncodeConfig(preset="published", tables="float16", epochs=200, width=8)
     fhash_codec.encode(values.astype(np.float32)[None], tmp_path / "run.fhz", config)
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
         scene = {
