@@ -143,13 +143,16 @@ AXES = (
     Axis(
         name="stages",
         preset="default",
-        varied=_one("without", (), ("tiles",), ("transform",), ("head",)),
+        varied=(*_one("without", (), ("tiles",), ("transform",)), {"train": "none"}),
         why="stages of the encoding, each left out",
     ),
     Axis(
         name="stages-of-bound",
         preset="default",
-        varied=_one("without", (), ("tiles",), ("transform",), ("head",), ("predictor",)),
+        varied=(
+            *_one("without", (), ("tiles",), ("transform",), ("predictor",)),
+            {"train": "none"},
+        ),
         why="the same for a strict bound of 1 % of the range, whatever is promised otherwise",
         common=(("psnr", None), ("max_error", None), ("max_error_rel", 0.01)),
     ),

@@ -36,7 +36,7 @@ from fhash_formats.transform.values import cast
 GAIN_BY_WIDTHS = {(12, 8): 1.0, (24, 16): 1.2, (48, 16): 1.35}
 """Gain in dB of an MLP by the widths of its hidden layers, as a multiple of that of the first."""
 MOST_WIDTHS = {"fast": 1, "balanced": 2, "small": 3}
-"""How many of these are considered, by the wish for access: decoding takes 5, 13 and 25 ns more for
+"""Number of these that are considered, by the wish for access: decoding takes 5, 13 and 25 ns more for
 each vertex (AVX-512; 8, 20 and 45 with AVX2), where SPERR takes some 40."""
 LEAST_GAIN = 0.3
 """Gain in dB of least squares below which nothing is trained: at 0.15 a training saved up to 4 % in
@@ -78,7 +78,7 @@ RATE = 3e-2
 """Highest learning rate of a first training of up to UPDATES; that of a longer one falls as the
 root of its length, or it diverges."""
 RATE_AGAIN = 1e-2
-"""That of further trainings."""
+"""Highest learning rate of further trainings."""
 MOST_AHEAD = 1.2
 """Factor of the steps of two passes that is believed at most."""
 LEFT = 0.97
@@ -246,9 +246,9 @@ def _trained(
             Budget(
                 updates=length,
                 samples=min(max(SAMPLES, SAMPLES_OF_UPDATE * updates), MOST_SAMPLES),
+                seed=task.config.seed + number,
                 rate=(RATE if number == 0 else RATE_AGAIN) * slower,
             ),
-            seed=task.config.seed + number,
             progress=_report(task, sum(lengths[:number]), length, sum(lengths)),
             start=trained,
         )

@@ -397,6 +397,8 @@ class Budget:
     """Number of training updates."""
     samples: int
     """Number of voxels that are learned from: what few teach, often repeated, holds for few."""
+    seed: int = 0
+    """Of the random numbers of its start and its samples."""
     rate: float = 1e-2
     """Highest learning rate. A short training gains as much as one of twice its length where it
     learns three times as fast; a long one does not."""
@@ -409,7 +411,6 @@ def train_head(
     widths: tuple[int, int],
     budget: Budget,
     *,
-    seed: int = 0,
     progress: Callable[[float], None] | None = None,
     start: TrainedHead | None = None,
 ) -> TrainedHead | None:
@@ -426,7 +427,7 @@ def train_head(
         What it raises ends the training.
     start: a head of these widths that goes on learning; None for a random start.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(budget.seed)
     bounds = np.float32(low), np.float32(high)
     counts = [max(1, round(n / BATCH_VOXELS)) for n in (budget.samples, budget.samples // 5)]
     drawn = draw(pairs, sum(counts) * BATCH_VOXELS, random, *bounds)

@@ -194,8 +194,8 @@ FHASH_CLONES_512 void activate(double* FHASH_RESTRICT values, int64_t outputs, d
     }
 }
 
-// Outputs of the last layer, in place, to errors, and these times their weights. An output beyond the
-// clip range is clipped, and its slope is 0.
+// Outputs of the last layer, in place, to errors, and these times their weights. An output beyond
+// the clip range is clipped, and its slope is 0.
 FHASH_CLONES_512 void errors_of(double* FHASH_RESTRICT values, double scale, double bias,
                             const int32_t* FHASH_RESTRICT targets,
                             const int32_t* FHASH_RESTRICT lowest,
