@@ -398,7 +398,7 @@ class Budget:
     samples: int
     """Number of voxels that are learned from: what few teach, often repeated, holds for few."""
     seed: int = 0
-    """Of the random numbers of its start and its samples."""
+    """Seed of the random numbers of its start and its samples."""
     rate: float = 1e-2
     """Highest learning rate. A short training gains as much as one of twice its length where it
     learns three times as fast; a long one does not."""

@@ -360,7 +360,7 @@ def test_a_table_that_leaves_its_part_to_the_mlp_takes_fewer_bytes(tmp_path: Pat
 
 
 def test_training_only_ever_wins(tmp_path: Path) -> None:
-    """No MLP is kept where it saves nothing, however long a training was asked for."""
+    """A training that saves nothing leaves no MLP, however long it was asked for."""
     source = np.random.default_rng(0).normal(size=(4, 12, 16, 20)).astype(np.float32)
     sizes = {}
     for train in ("none", "1s"):
