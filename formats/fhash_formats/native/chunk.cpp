@@ -388,7 +388,7 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     trial.draft = {{}, step, typical(task), task.low, task.high,
                    task.error < 0 ? 0.0 : 2 * task.reach * QUANTUM_SHARE, needs_real64(task, step),
                    true, false, task.origin, task.whole_low, task.whole_high};
-    trial.coding = {WEIGHT, task.error, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
+    trial.coding = {WEIGHT, task.error, 0, 0, 0, effort < 3 ? 1 : 2, 0, 1, 1, 1, 0};
     const Scaled scaled(task, trial.draft);
     const int64_t most = effort > 1 ? TRIED << 2 * (effort - 2) : 0;
     Form& form = trial.draft.form;
