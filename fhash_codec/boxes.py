@@ -327,8 +327,7 @@ class Mlp:
             are no layers, so that the values are those of the table.
         stencil: what the first layer sees, `CORNERS` or `NEIGHBOURS`.
         constants: further numbers where the stencil is NEIGHBOURS: `sigma`, `low` and `high`, in
-            data units, and `cross`, 1 where the second layer sees the first one's outputs at nine
-            vertices.
+            data units.
     """
 
     weights: tuple[npt.NDArray[np.float32], ...]

@@ -333,7 +333,6 @@ def _described(head: NeighbourHead | None) -> dict[str, Any] | None:
         return None
     return {
         "hidden": list(head.hidden),
-        "cross": head.cross,
         "sigma": head.sigma,
         "low": head.low,
         "high": head.high,

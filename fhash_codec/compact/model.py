@@ -113,12 +113,7 @@ def head_mlp(head: NeighbourHead | None) -> Mlp:
         biases=biases,
         activation="leaky",
         stencil=NEIGHBOURS,
-        constants={
-            "sigma": head.sigma,
-            "low": head.low,
-            "high": head.high,
-            "cross": int(head.cross),
-        },
+        constants={"sigma": head.sigma, "low": head.low, "high": head.high},
     )
 
 
@@ -191,7 +186,6 @@ def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> Neig
                 sigma=described["sigma"],
                 low=described["low"],
                 high=described["high"],
-                cross=described["cross"],
             )
     except (InputError, OverflowError) as error:
         raise DamagedFileError(f"the head of a plain file is damaged: {error}") from error

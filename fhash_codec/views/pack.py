@@ -485,7 +485,7 @@ def _header(
     weights, head = 0, None
     if settings is not None and settings.head is not None:
         weights = settings.head.size
-        head = {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
+        head = {"hidden": list(settings.head.hidden)}
     bound = {name: array.quality[name] for name in ("max_error",) if name in array.quality}
     encoder = {**source["encoder"], "command": PACKED}
     return {

@@ -3,7 +3,7 @@
 import numpy as np
 import zarr
 
-NEAR = [(0, 0, 0, 0)] + [tuple(d * (a == b) for b in range(4)) for a in range(4) for d in (-1, 1)]
+NEAR = [tuple(d * (a == b) for b in range(4)) for a in range(4) for d in (-1, 1)]
 FAR = [tuple(d * (a == b) for b in range(4)) for a in (1, 2, 3) for d in (-2, 2)]
 EDGES = [(0, *np.insert([d, e], a, 0)) for a in range(3) for d in (-1, 1) for e in (-1, 1)]
 f4 = np.float32
@@ -36,12 +36,10 @@ def corrected(tile, layers, head):
         return np.copysign(np.minimum(octaves, 4095), difference)
 
     unit = f4(1024) / (high - low) if high > low else f4(0)
-    inputs = [squeezed(shifted(tile, o) - tile) for o in NEAR[1:] + FAR + EDGES]
+    inputs = [squeezed(shifted(tile, o) - tile) for o in NEAR + FAR + EDGES]
     inputs.append(np.floor(np.minimum((tile - low) * unit + f4(0.5), 1024)) - 512)
     inputs.append(squeezed(tile - low))
     for number, (weight, bias, scale) in enumerate(layers):
-        if number == 1 and head["cross"]:
-            inputs = [shifted(values, o) for values in inputs for o in NEAR]
         sums = np.tensordot(np.rint(weight / scale), np.array(inputs, "f8"), 1).astype("f4")
         last, unit_in = number == len(layers) - 1, 128 if number else 512
         unit_out = sigma if last else f4(128)

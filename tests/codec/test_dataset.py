@@ -247,7 +247,7 @@ def test_a_head_makes_the_values_of_the_table(tmp_path: Path) -> None:
     with fhash_codec.open(path) as volume:
         mlp = volume.mlp
         assert mlp.activation == "leaky"
-        assert mlp.constants == {"sigma": 0.125, "low": -1.5, "high": 1.25, "cross": 1}
+        assert mlp.constants == {"sigma": 0.125, "low": -1.5, "high": 1.25}
         for layer, (weights, biases) in zip(head.layers, mlp.layers, strict=True):
             np.testing.assert_array_equal(weights, layer.weights * np.float64(layer.weight_scale))
             np.testing.assert_array_equal(biases, layer.biases * np.float64(layer.bias_scale))

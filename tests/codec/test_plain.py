@@ -203,7 +203,6 @@ WRONG = {
         profile="paper", fold=2, embedding_size=1, hidden_layers=0, width=1, tables="float32"
     ),
     "hidden": lambda model: model["head"].update(hidden=[4, 3, 2, 1]),
-    "cross": lambda model: model["head"].update(cross=1),
     "sigma": lambda model: model["head"].update(sigma=None),
 }
 

@@ -37,7 +37,7 @@ def with_head(path: Path, head: NeighbourHead) -> Path:
 
 
 def some_head(*, scale: float = 0.03125, sigma: float = 0.125) -> NeighbourHead:
-    """A head with a cross, of random weights."""
+    """A head of random weights."""
     rng = np.random.default_rng(3)
     layers = tuple(
         Layer(
@@ -46,6 +46,6 @@ def some_head(*, scale: float = 0.03125, sigma: float = 0.125) -> NeighbourHead:
             weight_scale=scale,
             bias_scale=0.0078125,
         )
-        for shape in ((4, 28), (3, 36), (1, 3))
+        for shape in ((4, 28), (3, 4), (1, 3))
     )
-    return NeighbourHead(layers=layers, sigma=sigma, low=-1.5, high=1.25, cross=True)
+    return NeighbourHead(layers=layers, sigma=sigma, low=-1.5, high=1.25)

@@ -53,7 +53,7 @@ GOLDENS = {
     ),
     "compact-mask": EncodeConfig(psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)),
     "compact-predictor": EncodeConfig(
-        max_error=0.3, effort=7, timings=False, preset="small", without=("head",)
+        max_error=0.3, effort=7, timings=False, preset="small", train="none"
     ),
     "compact-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
     "compact-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
@@ -61,9 +61,6 @@ GOLDENS = {
     "compact-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
     "compact-one-tile": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="whole"),
     "compact-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
-    "compact-cross": EncodeConfig(
-        max_error=0.02, effort=2, timings=False, tile="5x6x4x9", features=("interval:0.5:2",)
-    ),
     "compact-many-labels": EncodeConfig(
         max_error=0.0, effort=2, timings=False, features=("interval:700:9000",), dilation=0
     ),
@@ -134,7 +131,6 @@ GOLDENS = {
 
 PLAIN = {
     "compact-plain-bound": "compact-bound",
-    "compact-plain-cross": "compact-cross",
     "compact-plain-head": "compact-head",
     "compact-plain-labels": "compact-labels",
     "paper-plain-coded": "paper-coded-occupancy",
@@ -277,10 +273,9 @@ def long_axis() -> ArraySeries:
     return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME, "x": x})
 
 
-def head(name: str) -> NeighbourHead:
-    """A head of random weights that hardly changes a value: one layer, or two with a cross."""
+def head() -> NeighbourHead:
+    """A head of random weights that hardly changes a value, of one hidden layer."""
     chance = np.random.default_rng(3)
-    shapes = [(4, 28), (1, 4)] if name.endswith("-head") else [(4, 28), (3, 36), (1, 3)]
     layers = tuple(
         Layer(
             weights=chance.integers(-20, 21, shape).astype(np.int8),
@@ -288,9 +283,9 @@ def head(name: str) -> NeighbourHead:
             weight_scale=0.0123291015625,
             bias_scale=0.0078125,
         )
-        for shape in shapes
+        for shape in ((4, 28), (1, 4))
     )
-    return NeighbourHead(layers=layers, sigma=0.015625, low=-1.0, high=2.0, cross=len(shapes) == 3)
+    return NeighbourHead(layers=layers, sigma=0.015625, low=-1.0, high=2.0)
 
 
 def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
@@ -299,7 +294,7 @@ def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
 
     def coded(*arguments: Any, **options: Any) -> CodedTable:
         table = code(*arguments, **options)
-        settings = replace(table.plan.settings, head=head(name))
+        settings = replace(table.plan.settings, head=head())
         return replace(table, plan=replace(table.plan, settings=settings))
 
     with (
@@ -354,7 +349,7 @@ def make(name: str, path: Path) -> None:
         pack(path)
     elif name in PLAIN:
         fhash_codec.export_plain(HERE / f"{PLAIN[name]}.fhz", path)
-    elif name.endswith(("-head", "-cross")):
+    elif name.endswith("-head"):
         encode_with_head(name, path, GOLDENS[name])
     else:
         fhash_codec.encode(SERIES.get(name, series)(), path, GOLDENS[name])

@@ -425,7 +425,6 @@ PLAIN: tuple[Rule, ...] = (
         "header.model.head.hidden",
         ([], [4], [4, 3], [3, 4], [4, 3, 1], [64] * 3, [65], [0]),
     ),
-    ("header.model.head.cross", (True, False, 1, None, "true")),
     (
         "header.model.head.sigma|low|high",
         (*FLOATS, 0.0, 1.0, 1e-38, 2.0**-100, 2.0**100, 2.0**127),

@@ -12,6 +12,7 @@ import random
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,7 +34,7 @@ from fhash_formats.container.array import ArrayMetadata, Sharding, pack_index, p
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
 from fhash_formats.errors import InputError
 from fhash_formats.native import crc32c
-from fhash_formats.transform.head import Layer, NeighbourHead, layer_inputs
+from fhash_formats.transform.head import INPUTS, Layer, NeighbourHead
 from fhash_formats.transform.predict import passes_of
 from fhash_formats.transform.spec import MAX_LABELS, Basis
 from fhash_formats.transform.tile import NO_TRANSFORM
@@ -333,8 +334,7 @@ def _basis(chance: random.Random, shape: tuple[int, ...]) -> Any:
 
 def _head(chance: random.Random) -> Any:
     """Return a packed head with extreme numbers."""
-    cross = chance.random() < 0.4
-    hidden = [chance.choice((1, 3, 14)) for _ in range(2 if cross else chance.randrange(1, 4))]
+    hidden = [chance.choice((1, 3, 14)) for _ in range(chance.randrange(1, 4))]
     rng = np.random.default_rng(chance.getrandbits(32))
     scales = (6.0e-8, 0.001, 1.0, 65504.0)
     layers = tuple(
@@ -344,13 +344,13 @@ def _head(chance: random.Random) -> Any:
             weight_scale=float(np.float16(chance.choice(scales))),
             bias_scale=float(np.float16(chance.choice(scales))),
         )
-        for width, columns in zip([*hidden, 1], layer_inputs(hidden, cross), strict=True)
+        for columns, width in pairwise((INPUTS, *hidden, 1))
     )
     ends = sorted(chance.choices((-3.4e38, -1.0, 0.0, 1e-45, 1.0, 2.0, 3.4e38), k=2))
     low, high, sigma = map(
         float, np.float32([*ends, chance.choice((2.0**-100, 1e-6, 1.0, 2.0**100))])
     )
-    head = NeighbourHead(layers=layers, sigma=sigma, low=low, high=high, cross=cross)
+    head = NeighbourHead(layers=layers, sigma=sigma, low=low, high=high)
     return _packed(chance, head.to_bytes())
 
 

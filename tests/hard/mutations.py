@@ -28,7 +28,7 @@ NEWEST = (
     "compact-labels",
     "compact-counts",
     "compact-classes",
-    "compact-cross",
+    "compact-linear",
     "compact-many-labels",
 )
 """Goldens that take turns most evenly, with clipped values and with labels in turns: every kind

@@ -33,14 +33,12 @@ def _diagonal(one: int, other: int) -> list[tuple[int, ...]]:
     ]
 
 
-NEAREST = [place for axis in range(4) for place in _along(axis, -1, 1)]
 OFFSETS = [
-    *NEAREST,
+    *(place for axis in range(4) for place in _along(axis, -1, 1)),
     *(place for axis in (1, 2, 3) for place in _along(axis, -2, 2)),
     *(place for pair in ((2, 3), (1, 3), (1, 2)) for place in _diagonal(*pair)),
 ]
 """The 26 neighbours of a vertex, along t, z, y, x, in the order of the inputs."""
-CROSS = [(0, 0, 0, 0), *NEAREST]
 
 
 class Layer(NamedTuple):
@@ -55,7 +53,6 @@ class Head(NamedTuple):
     """A network, the error that it was trained for, and the range of its results."""
 
     layers: list[Layer]
-    cross: bool
     sigma: np.float32
     low: np.float32
     high: np.float32
@@ -63,12 +60,9 @@ class Head(NamedTuple):
 
 def unpack_head(data: bytes) -> Head:
     """The head of its packed bytes."""
-    cross = data[0] == 0x82
-    count = 2 if cross else data[0]
+    count = data[0]
     widths = [*data[1 : 1 + count], 1]
     inputs = [len(OFFSETS) + 2, *widths[:-1]]
-    if cross:
-        inputs[1] *= len(CROSS)
     sigma, low, high = (np.float32(v) for v in struct.unpack_from("<3f", data, 1 + count))
     at = 13 + count
     scales = [struct.unpack_from("<eeB", data, at + 5 * layer) for layer in range(count + 1)]
@@ -91,7 +85,7 @@ def unpack_head(data: bytes) -> Head:
         layers.append(Layer(matrix, scale, shift))
     if state != 1:
         raise ValueError("the weights of a head do not end where their code ends")
-    return Head(layers, cross, sigma, low, high)
+    return Head(layers, sigma, low, high)
 
 
 def pop_weights(state: int, count: int, spread: int) -> tuple[int, list[int]]:
@@ -113,10 +107,7 @@ def apply_head(decoded: Floats, head: Head) -> Floats:
     values = clip(decoded, head.low, head.high)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         activations = np.stack(inputs_of(values, head))
-        for number, layer in enumerate(head.layers):
-            if head.cross and number == 1:
-                crossed = [moved(plane, place) for plane in activations for place in CROSS]
-                activations = np.stack(crossed)
+        for layer in head.layers:
             outputs = np.tensordot(layer.weights, activations, 1) + np.float32(0)
             outputs = outputs * layer.scale + layer.biases.reshape(-1, 1, 1, 1, 1)
             leaky = np.where(outputs > 0, outputs, np.float32(0.125) * outputs)

@@ -167,9 +167,7 @@ def tiles(draw: Draw) -> tuple[Any, TileSettings, Coding, Any]:
         quantum=quantum,
         head=None
         if double or draw(st.booleans())
-        else random_head(
-            low=float(np.float32(low)), high=float(np.float32(high)), cross=draw(st.booleans())
-        ),
+        else random_head(low=float(np.float32(low)), high=float(np.float32(high))),
         mask=MaskLevels(
             edges=edges,
             scores=(3, 700)[: len(edges) + 1],

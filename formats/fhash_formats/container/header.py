@@ -684,8 +684,6 @@ def _check_plain(model: Record) -> None:
     head.integers("hidden", count, 1, MAX_HEAD_WIDTH)
     for key in ("sigma", "low", "high"):
         head.number(key)
-    head.need(isinstance(head.get("cross"), bool), "cross", "true or false")
-    head.need(not head.get("cross") or count == 2, "hidden", "2 widths of a head with a cross")
 
 
 def brief(header: Mapping[str, Any]) -> dict[str, Any]:

@@ -64,7 +64,7 @@ from fhash_formats.container.zip_file import (
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.series import Coordinate, meant
 from fhash_formats.support.files import is_url, local_path
-from fhash_formats.transform.head import layer_inputs
+from fhash_formats.transform.head import INPUTS
 
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
 """Name, shape and allowed number types of an array."""
@@ -142,13 +142,13 @@ def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
         head = model["head"]
         if head is None:
             return []
-        inputs = layer_inputs(head["hidden"], head["cross"])
-        return list(zip([*head["hidden"], 1], inputs, strict=True))
-    widths = [
-        len(model["levels"]) * model["embedding_size"],
-        *[model["width"]] * model["hidden_layers"],
-        1,
-    ]
+        widths = [INPUTS, *head["hidden"], 1]
+    else:
+        widths = [
+            len(model["levels"]) * model["embedding_size"],
+            *[model["width"]] * model["hidden_layers"],
+            1,
+        ]
     return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
 
 

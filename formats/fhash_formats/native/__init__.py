@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 22
+ABI_VERSION = 23
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -75,7 +75,7 @@ PROTOTYPES: Prototypes = {
     **_TILES,
     "fhash_encode_block": (*(ARRAY,) * 3, INTEGER),
     "fhash_decode_block": (ARRAY, INTEGER, ARRAY, ARRAY),
-    "fhash_head_apply": (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY),
+    "fhash_head_apply": (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, ARRAY),
     "fhash_crc32c": (ARRAY, INTEGER, INTEGER, INTEGER),
 }
 """Functions of this package's library that Python calls."""

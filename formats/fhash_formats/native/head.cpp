@@ -90,19 +90,19 @@ struct Last {
 
 // Rows of pairs that the layers of a block work on.
 struct Rooms {
-    alignas(64) std::int32_t first[(MAX_WIDTH + 8) / 2 * BLOCK];
-    alignas(64) std::int32_t second[(MAX_WIDTH + 8) / 2 * BLOCK];
+    alignas(64) std::int32_t first[MAX_PAIRS * BLOCK];
+    alignas(64) std::int32_t second[MAX_PAIRS * BLOCK];
     alignas(64) float values[BLOCK];
 };
 
-// The layers from a network's second on, over inputs that are gathered; the corrected values of a
-// block, and the correction of its first voxel.
+// The layers of a network over inputs that are gathered; the corrected values of a block, and the
+// correction of its first voxel.
 inline float evaluate(const Kernels& kernels, const Stage* stages, std::int64_t layers,
                       const std::int32_t** inputs, const float* centre, const Range& range,
                       std::int64_t groups, Rooms& rooms, float* out) {
     std::int32_t *room = rooms.second, *other = rooms.first;
     for (std::int64_t layer = 0; layer + 1 < layers; ++layer) {
-        kernels.hidden_layer(inputs, stages[layer], groups, room, BLOCK);
+        kernels.hidden_layer(inputs, stages[layer], groups, room);
         for (std::int64_t pair = 0; pair < stages[layer].outputs / 2; ++pair)
             inputs[pair] = room + pair * BLOCK;
         std::int32_t* const swapped = room;
@@ -112,27 +112,25 @@ inline float evaluate(const Kernels& kernels, const Stage* stages, std::int64_t 
     return kernels.last_layer(inputs, stages[layers - 1], centre, range, groups, out);
 }
 
-// Correct some rows of one time step. source: gathers the inputs of the first of the stages from
-// the rows of the first NEAR neighbours.
-template <int NEAR, class Source>
-void correct(const Frames& frames, const Source& source, const Kernels& kernels,
-             const Stage* stages, std::int64_t layers, std::int64_t step,
-             const Rows& some, Rooms& rooms, Last& last, float* out) {
+// Correct some rows of one time step.
+inline void correct(const Frames& frames, const Kernels& kernels, const Stage* stages,
+                    std::int64_t layers, std::int64_t step, const Rows& some, Rooms& rooms,
+                    Last& last, float* out) {
     for (std::int64_t r = some.begin; r < some.end; ++r) {
         std::int64_t row_of[NEIGHBOURS];
-        frames.neighbours<NEAR>(step, r, row_of);
+        frames.neighbours(step, r, row_of);
         const std::int64_t own = frames.row(step, 0, r);
         for (std::int64_t b = 0; b < frames.blocks; ++b) {
             const float* const centre = frames.block(own, b);
             const std::int64_t n = frames.length(b), groups = groups_of(n);
             float* const target = out + (step * frames.rows + r) * frames.x + b * BLOCK;
             float* const corrected = n % GROUP ? rooms.values : target;
-            const Flat flat = source.flatness(own, row_of, b);
+            const Flat flat = frames.flatness(own, row_of, b);
             if (flat.same(last.flat)) {
                 kernels.correct_all(centre, last.correction, frames.range, groups, corrected);
             } else {
                 const std::int32_t* inputs[MAX_PAIRS];
-                source.gather(kernels, own, row_of, b, groups, rooms.first, inputs);
+                frames.gather(kernels, own, row_of, b, groups, rooms.first, inputs);
                 const float correction = evaluate(kernels, stages, layers, inputs, centre,
                                                   frames.range, groups, rooms, corrected);
                 if (flat.level) last = {flat, correction};
@@ -154,16 +152,13 @@ FHASH_INLINE bool sound(const std::int64_t* shape, std::int64_t layers,
     return true;
 }
 
-// The stages of a network. cross: whether the second of three layers sees the first over the cross.
-// False where memory ran out.
-inline bool make_stages(const Network& network, bool cross, int tile, Stage* stages) {
+// The stages of a network. False where memory ran out.
+inline bool make_stages(const Network& network, int tile, Stage* stages) {
     const float* weights = network.weights;
     const float* biases = network.biases;
     for (std::int64_t layer = 0; layer < network.layers; ++layer) {
-        const std::int64_t repeats = cross && layer == 1 ? CROSS : 1;
-        const std::int64_t inputs = repeats * network.widths[layer];
-        const std::int64_t outputs = network.widths[layer + 1];
-        if (!make_stage(weights, biases, network.scales[layer], inputs, outputs, repeats,
+        const std::int64_t inputs = network.widths[layer], outputs = network.widths[layer + 1];
+        if (!make_stage(weights, biases, network.scales[layer], inputs, outputs,
                         layer + 1 == network.layers, tile, stages[layer]))
             return false;
         weights += inputs * outputs;
@@ -172,36 +167,16 @@ inline bool make_stages(const Network& network, bool cross, int tile, Stage* sta
     return true;
 }
 
-inline std::int64_t apply(Frames& frames, const Kernels& kernels, const Stage* stages,
-                          std::int64_t layers, const Rows& some, float* out) {
+inline void apply(Frames& frames, const Kernels& kernels, const Stage* stages,
+                  std::int64_t layers, const Rows& some, float* out) {
     Rooms rooms;
     Last last;
-    const Rows seen = frames.around(some, HALO);
+    const Rows seen = frames.around(some);
     frames.load(0, seen);
     for (std::int64_t step = 0; step < frames.t; ++step) {
         if (step + 1 < frames.t) frames.load(step + 1, seen);
-        correct<NEIGHBOURS>(frames, frames, kernels, stages, layers, step, some, rooms, last, out);
+        correct(frames, kernels, stages, layers, step, some, rooms, last, out);
     }
-    return 0;
-}
-
-inline std::int64_t apply_cross(Frames& frames, const Kernels& kernels, const Stage* stages,
-                                const Rows& some, float* out) {
-    Hidden hidden(frames, kernels, stages[0]);
-    if (!hidden.allocated()) return OUT_OF_MEMORY;
-    hidden.used = stages[1].inputs / CROSS;
-    Rooms rooms;
-    Last last;
-    const Rows needed = frames.around(some, 1), seen = frames.around(needed, HALO);
-    frames.load(0, seen);
-    for (std::int64_t ahead = 0; ahead <= frames.t; ++ahead) {
-        if (ahead + 1 < frames.t) frames.load(ahead + 1, seen);
-        if (ahead < frames.t) hidden.fill(ahead, needed, rooms.first);
-        if (ahead > 0)
-            correct<CROSS - 1>(frames, hidden, kernels, stages + 1, 2, ahead - 1, some, rooms, last,
-                    out);
-    }
-    return 0;
 }
 
 }  // namespace
@@ -210,8 +185,6 @@ inline std::int64_t apply_cross(Frames& frames, const Kernels& kernels, const St
 //
 // decoded, out: (t, z, y, x) of `shape`, every length at least 1; of `out` only those rows are
 // written. Both may be the same array if the rows are all of them.
-// cross: 0, or 1 for three layers of which the second takes the first one's outputs over the
-// cross: its weights are then (out, CROSS * in).
 // lanes: 0 for the widest that this machine has; tests ask for others, see kernels_of.
 //
 // Returns 0, or -1 for arguments out of range and lanes that this machine lacks, or -2 where memory
@@ -221,9 +194,8 @@ FHASH_KERNEL std::int64_t fhash_head_apply(const float* decoded, const std::int6
                                            std::int64_t layers, const std::int64_t* widths,
                                            const float* weights, const float* biases,
                                            const float* scales, const float* constants,
-                                           std::int64_t cross, std::int64_t lanes, float* out) {
+                                           std::int64_t lanes, float* out) {
     if (!sound(shape, layers, widths)) return BAD_ARGUMENT;
-    if (cross && (layers != 3 || widths[1] > MAX_CROSS_WIDTH)) return BAD_ARGUMENT;
     if (first < 0 || last > shape[1] * shape[2] || first > last) return BAD_ARGUMENT;
     const Kernels* const kernels = kernels_of(lanes);
     if (!kernels) return BAD_ARGUMENT;
@@ -231,8 +203,7 @@ FHASH_KERNEL std::int64_t fhash_head_apply(const float* decoded, const std::int6
     Frames frames(decoded, shape, range);
     Stage stages[MAX_LAYERS];
     const Network network{layers, widths, weights, biases, scales};
-    if (!frames.allocated() || !make_stages(network, cross != 0, kernels->tile, stages))
-        return OUT_OF_MEMORY;
-    return cross ? apply_cross(frames, *kernels, stages, {first, last}, out)
-                 : apply(frames, *kernels, stages, layers, {first, last}, out);
+    if (!frames.allocated() || !make_stages(network, kernels->tile, stages)) return OUT_OF_MEMORY;
+    apply(frames, *kernels, stages, layers, {first, last}, out);
+    return 0;
 }

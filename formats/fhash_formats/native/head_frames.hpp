@@ -1,4 +1,4 @@
-// The frames of a tile that the head looks at, and the outputs of its first layer.
+// The frames of a tile that the head looks at.
 #pragma once
 
 #include <memory>
@@ -97,9 +97,9 @@ public:
 
     bool allocated() const { return frames && extremes; }
 
-    // Some rows, and those that lie up to `reach` vertices beside them along z and y.
-    Rows around(const Rows& some, std::int64_t reach) const {
-        const std::int64_t more = reach * ((z > 1 ? y : 0) + 1);
+    // Some rows, and those that their neighbours lie in.
+    Rows around(const Rows& some) const {
+        const std::int64_t more = HALO * ((z > 1 ? y : 0) + 1);
         return {some.begin > more ? some.begin - more : 0,
                 some.end < rows - more ? some.end + more : rows};
     }
@@ -114,8 +114,7 @@ public:
         return step % held * rows + zi * y + yi;
     }
 
-    // The rows of the first COUNT neighbours of row r of a frame.
-    template <int COUNT>
+    // The rows of the neighbours of row r of a frame.
     FHASH_INLINE void neighbours(std::int64_t step, std::int64_t r, std::int64_t* row_of) const {
         std::int64_t ts[3], zs[5], ys[5];
         const std::int64_t zi = r / y, yi = r % y;
@@ -123,7 +122,7 @@ public:
         for (int d = 0; d < 5; ++d) zs[d] = clamped(zi + d - 2, z) * y;
         for (int d = 0; d < 5; ++d) ys[d] = clamped(yi + d - 2, y);
         FHASH_UNROLLED
-        for (int k = 0; k < COUNT; ++k)
+        for (int k = 0; k < NEIGHBOURS; ++k)
             row_of[k] = ts[OFFSETS[k][0] + 1] + zs[OFFSETS[k][1] + 2] + ys[OFFSETS[k][2] + 2];
     }
 
@@ -171,96 +170,6 @@ private:
     const float* decoded;
     std::unique_ptr<float[]> frames;
     std::unique_ptr<Extremes[]> extremes;
-};
-
-// First-layer outputs of the frames t - 1, t and t + 1. A row holds its pairs of outputs one after
-// the other, with the edges repeated once.
-class Hidden {
-public:
-    Hidden(const Frames& source, const Kernels& kernels_, const Stage& stage)
-        : frames(source),
-          kernels(kernels_),
-          first(stage),
-          width(stage.outputs / 2),
-          pitch(source.blocks * BLOCK + 2),
-          values(new (std::nothrow) std::int32_t[source.held * source.rows * width * pitch]()),
-          flats(new (std::nothrow) Flat[source.held * source.rows * source.blocks]) {}
-
-    bool allocated() const { return values && flats; }
-
-    // Compute the outputs of some rows of one frame.
-    void fill(std::int64_t step, const Rows& some, std::int32_t* room) {
-        for (std::int64_t r = some.begin; r < some.end; ++r) {
-            std::int64_t row_of[NEIGHBOURS];
-            frames.neighbours<NEIGHBOURS>(step, r, row_of);
-            const std::int64_t own = frames.row(step, 0, r);
-            for (std::int64_t b = 0; b < frames.blocks; ++b) fill_block(own, row_of, b, room);
-            std::int32_t* const row = values.get() + own * width * pitch;
-            for (std::int64_t o = 0; o < width; ++o) {
-                row[o * pitch] = row[o * pitch + 1];
-                row[o * pitch + 1 + frames.x] = row[o * pitch + frames.x];
-            }
-        }
-    }
-
-    // The inputs of the second layer: the outputs of the first at the voxel and at its neighbours
-    // of the cross, where they lie.
-    void gather(const Kernels&, std::int64_t own, const std::int64_t* row_of, std::int64_t b,
-                std::int64_t, std::int32_t*, const std::int32_t** inputs) const {
-        for (std::int64_t k = 0; k < CROSS; ++k) {
-            const std::int64_t row = k == 0 ? own : row_of[k - 1];
-            const std::int64_t shift = 1 + b * BLOCK + (k == 0 ? 0 : OFFSETS[k - 1][3]);
-            const std::int32_t* const source = values.get() + row * width * pitch + shift;
-            for (std::int64_t o = 0; o < used; ++o) *inputs++ = source + o * pitch;
-        }
-    }
-
-    // The flatness of a block. It is level only where the block and all blocks that its cross
-    // reaches have the same constant outputs.
-    Flat flatness(std::int64_t own, const std::int64_t* row_of, std::int64_t b) const {
-        const Flat* const here = &flats[own * frames.blocks + b];
-        Flat flat = *here;
-        flat.level = flat.level && (b == 0 || flat.same(here[-1])) &&
-                     (b + 1 == frames.blocks || flat.same(here[1]));
-        for (std::int64_t k = 0; k < CROSS - 1; ++k)
-            flat.level = flat.same(flats[row_of[k] * frames.blocks + b]);
-        return flat;
-    }
-
-private:
-    void fill_block(std::int64_t own, const std::int64_t* row_of, std::int64_t b,
-                    std::int32_t* room) {
-        const std::int64_t groups = groups_of(frames.length(b));
-        std::int32_t* const target = values.get() + own * width * pitch + 1 + b * BLOCK;
-        const Flat flat = frames.flatness(own, row_of, b);
-        flats[own * frames.blocks + b] = flat;
-        if (flat.same(last)) {
-            for (std::int64_t o = 0; o < width; ++o)
-                for (std::int64_t i = 0; i < groups * GROUP; ++i)
-                    target[o * pitch + i] = constant[o];
-            return;
-        }
-        const std::int32_t* inputs[INPUTS / 2];
-        frames.gather(kernels, own, row_of, b, groups, room, inputs);
-        kernels.hidden_layer(inputs, first, groups, target, pitch);
-        if (!flat.level) return;
-        last = flat;
-        for (std::int64_t o = 0; o < width; ++o) constant[o] = target[o * pitch];
-    }
-
-    const Frames& frames;
-    const Kernels& kernels;
-    const Stage& first;
-
-public:
-    std::int64_t used = 0;  // pairs of outputs that the second layer takes
-
-private:
-    const std::int64_t width, pitch;
-    std::unique_ptr<std::int32_t[]> values;
-    std::unique_ptr<Flat[]> flats;
-    Flat last{false, 0, 0};
-    std::int32_t constant[MAX_WIDTH];
 };
 
 }  // namespace

@@ -49,8 +49,8 @@ FHASH_TARGET FHASH_INLINE void sum_products(const std::int32_t* const* inputs, s
 
 template <class Lanes, int VECTORS, int OUTPUTS>
 FHASH_TARGET FHASH_INLINE void hidden_part(const std::int32_t* const* inputs, const Stage& stage,
-                                           std::int64_t first, std::int64_t at, std::int32_t* out,
-                                           std::int64_t pitch) {
+                                           std::int64_t first, std::int64_t at,
+                                           std::int32_t* out) {
     typename Lanes::Ints sums[OUTPUTS][VECTORS];
     sum_products<Lanes, VECTORS, OUTPUTS>(inputs, stage.inputs,
                                           stage.weights + first * stage.inputs, at, sums);
@@ -59,7 +59,7 @@ FHASH_TARGET FHASH_INLINE void hidden_part(const std::int32_t* const* inputs, co
         const auto one = Lanes::all(stage.biases[first + o]);
         const auto two = Lanes::all(stage.biases[first + o + 1]);
         for (int v = 0; v < VECTORS; ++v)
-            Lanes::store(out + (first + o) / 2 * pitch + at + v * Lanes::COUNT,
+            Lanes::store(out + (first + o) / 2 * BLOCK + at + v * Lanes::COUNT,
                          Lanes::pairs(Lanes::activated(sums[o][v], scale, one),
                                       Lanes::activated(sums[o + 1][v], scale, two)));
     }
@@ -68,26 +68,26 @@ FHASH_TARGET FHASH_INLINE void hidden_part(const std::int32_t* const* inputs, co
 template <class Lanes, int VECTORS>
 FHASH_TARGET FHASH_INLINE void hidden_outputs(const std::int32_t* const* inputs,
                                               const Stage& stage, std::int64_t at,
-                                              std::int32_t* out, std::int64_t pitch) {
+                                              std::int32_t* out) {
     for (std::int64_t first = 0; first < stage.outputs; first += stage.tile) {
         switch (stage.tile) {
-            case 8: hidden_part<Lanes, VECTORS, 8>(inputs, stage, first, at, out, pitch); break;
-            case 6: hidden_part<Lanes, VECTORS, 6>(inputs, stage, first, at, out, pitch); break;
-            case 4: hidden_part<Lanes, VECTORS, 4>(inputs, stage, first, at, out, pitch); break;
-            default: hidden_part<Lanes, VECTORS, 2>(inputs, stage, first, at, out, pitch);
+            case 8: hidden_part<Lanes, VECTORS, 8>(inputs, stage, first, at, out); break;
+            case 6: hidden_part<Lanes, VECTORS, 6>(inputs, stage, first, at, out); break;
+            case 4: hidden_part<Lanes, VECTORS, 4>(inputs, stage, first, at, out); break;
+            default: hidden_part<Lanes, VECTORS, 2>(inputs, stage, first, at, out);
         }
     }
 }
 
-// A hidden layer: the pairs of its outputs, `pitch` apart.
+// A hidden layer: the pairs of its outputs.
 FHASH_TARGET inline void hidden_layer(const std::int32_t* const* inputs, const Stage& stage,
-                                      std::int64_t groups, std::int32_t* out, std::int64_t pitch) {
+                                      std::int64_t groups, std::int32_t* out) {
     using Lanes = FHASH_LANES;
     std::int64_t at = 0;
     for (; at + 2 * Lanes::COUNT <= groups * GROUP; at += 2 * Lanes::COUNT)
-        hidden_outputs<Lanes, 2>(inputs, stage, at, out, pitch);
+        hidden_outputs<Lanes, 2>(inputs, stage, at, out);
     for (; at < groups * GROUP; at += Lanes::COUNT)
-        hidden_outputs<Lanes, 1>(inputs, stage, at, out, pitch);
+        hidden_outputs<Lanes, 1>(inputs, stage, at, out);
 }
 
 // The last layer: corrected and clipped values of `groups` groups; the correction of the first.

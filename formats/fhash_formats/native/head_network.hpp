@@ -20,9 +20,7 @@ constexpr std::int64_t INPUTS = 28;  // 26 neighbours, two functions of the cent
 constexpr std::int64_t NEIGHBOURS = INPUTS - 2;
 constexpr std::int64_t MAX_WIDTH = 64;
 constexpr std::int64_t MAX_LAYERS = 4;
-constexpr std::int64_t CROSS = 9;             // a voxel, and the first 8 of the OFFSETS
-constexpr std::int64_t MAX_CROSS_WIDTH = 14;  // first-layer outputs that a cross may take
-constexpr std::int64_t MAX_PAIRS = CROSS * MAX_CROSS_WIDTH / 2;  // of the inputs of a layer
+constexpr std::int64_t MAX_PAIRS = (MAX_WIDTH + 8) / 2;  // of a layer's inputs or outputs
 
 // Offsets along (t, z, y, x) to the neighbours, in the order of the inputs.
 constexpr int OFFSETS[NEIGHBOURS][4] = {
@@ -60,32 +58,28 @@ struct Stage {
     float scale = 0.0F;
     std::unique_ptr<std::int32_t[]> held;  // the weights
     const std::int32_t* weights = nullptr;  // of each tile of outputs: (inputs, tile) pairs
-    float biases[MAX_WIDTH + 8] = {};
+    float biases[2 * MAX_PAIRS] = {};
 };
 
 // The functions of head_kernels.hpp for one set of lanes.
 struct Kernels {
     void (*first_inputs)(const float* const*, const float*, const Range&, std::int64_t,
                          std::int32_t*);
-    void (*hidden_layer)(const std::int32_t* const*, const Stage&, std::int64_t, std::int32_t*,
-                         std::int64_t);
+    void (*hidden_layer)(const std::int32_t* const*, const Stage&, std::int64_t, std::int32_t*);
     float (*last_layer)(const std::int32_t* const*, const Stage&, const float*, const Range&,
                         std::int64_t, float*);
     void (*correct_all)(const float*, float, const Range&, std::int64_t, float*);
     int tile;  // most outputs that a hidden layer sums together
 };
 
-// Fill a stage. repeats: how many times each input stands in the weights, one after the other:
-// CROSS for the second layer of a cross, whose pairs are of two inputs at the same place. last:
-// whether it is the last layer. False where memory ran out.
+// Fill a stage. last: whether it is the last layer. most: outputs that a tile has at most. False
+// where memory ran out.
 inline bool make_stage(const float* weights, const float* biases, float scale, std::int64_t inputs,
-                       std::int64_t outputs, std::int64_t repeats, bool last, int most,
-                       Stage& stage) {
+                       std::int64_t outputs, bool last, int most, Stage& stage) {
     const std::int64_t tiles = (outputs + most - 1) / most;
     stage.tile = last ? 1 : ((outputs + tiles - 1) / tiles + 1) / 2 * 2;
     stage.outputs = (outputs + stage.tile - 1) / stage.tile * stage.tile;
-    const std::int64_t single = inputs / repeats, halves = (single + 1) / 2;
-    stage.inputs = halves * repeats;
+    stage.inputs = (inputs + 1) / 2;
     stage.scale = scale;
     stage.held.reset(new (std::nothrow) std::int32_t[stage.inputs * stage.outputs]());
     if (!stage.held) return false;
@@ -93,15 +87,12 @@ inline bool make_stage(const float* weights, const float* biases, float scale, s
     for (std::int64_t o = 0; o < outputs; ++o) {
         stage.biases[o] = biases[o];
         std::int32_t* const tile = stage.held.get() + o / stage.tile * stage.tile * stage.inputs;
-        for (std::int64_t k = 0; k < repeats; ++k)
-            for (std::int64_t half = 0; half < halves; ++half) {
-                const float* const from = weights + o * inputs + k;
-                const int one = static_cast<int>(from[2 * half * repeats]);
-                const bool paired_up = 2 * half + 1 < single;
-                const int two =
-                    paired_up ? static_cast<int>(from[(2 * half + 1) * repeats]) : 0;
-                tile[(k * halves + half) * stage.tile + o % stage.tile] = paired(one, two);
-            }
+        const float* const from = weights + o * inputs;
+        for (std::int64_t pair = 0; pair < stage.inputs; ++pair) {
+            const int one = static_cast<int>(from[2 * pair]);
+            const int two = 2 * pair + 1 < inputs ? static_cast<int>(from[2 * pair + 1]) : 0;
+            tile[pair * stage.tile + o % stage.tile] = paired(one, two);
+        }
     }
     return true;
 }

@@ -68,7 +68,7 @@ std::int64_t fhash_reconstruct_f64(const std::int32_t*, double*, FHASH_TRANSFORM
                                    const double*);
 std::int64_t fhash_head_apply(const float*, const std::int64_t*, std::int64_t, std::int64_t,
                               std::int64_t, const std::int64_t*, const float*, const float*,
-                              const float*, const float*, std::int64_t, std::int64_t, float*);
+                              const float*, const float*, std::int64_t, float*);
 
 // quantise.cpp, trellis.cpp, values.cpp
 #define FHASH_TRELLIS_TABLE const std::int64_t*, const std::int32_t*, std::int64_t

@@ -22,12 +22,11 @@ struct Part {
 };
 
 // A part and what its head sees around it.
-Part widened(const Part& part, const Shape& shape, const Head& head) {
+Part widened(const Part& part, const Shape& shape) {
     Part wide;
     for (int a = 0; a < 4; a++) {
-        const int64_t reach = REACH[a] + head.cross;
-        wide.first[a] = std::max<int64_t>(0, part.first[a] - reach);
-        wide.last[a] = std::min(shape[(size_t)a], part.last[a] + reach);
+        wide.first[a] = std::max<int64_t>(0, part.first[a] - REACH[a]);
+        wide.last[a] = std::min(shape[(size_t)a], part.last[a] + REACH[a]);
     }
     return wide;
 }
@@ -172,7 +171,7 @@ FHASH_KERNEL int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_
         if (!is_part(part, job.shape, some))
             return fail(failed, FHASH_ERROR_ARGUMENT, "a part lies in its tile");
         if (!job.settings || !job.settings->head) return true;
-        const Shape seen = widened(some, job.shape, *job.settings->head).shape();
+        const Shape seen = widened(some, job.shape).shape();
         const Shape& all = job.shape;
         if (SHARE * seen[1] * seen[2] * seen[3] > all[1] * all[2] * all[3]) return true;
         const Stream& of = job.stream;
@@ -198,7 +197,7 @@ FHASH_KERNEL int32_t fhash_tile_part(fhash_context* context, const fhash_tile* t
                             "a part lies in its tile, which has a head");
             // At the ends of the tile the head sees its edge either way; farther in, what it sees
             // instead of what was cut off is cut off again.
-            const Part wide = widened(some, shape, *settings->head);
+            const Part wide = widened(some, shape);
             const std::vector<float> base = copied(table, shape, wide);
             std::vector<float> head(base.size());
             if (!apply_head(*context, *settings->head, base.data(), wide.shape(), head.data(),

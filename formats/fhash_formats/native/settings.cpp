@@ -241,21 +241,17 @@ bool no_head(fhash_error& error, const char* what) {
                 "the settings of a coded tile are damaged: a damaged neighbourhood head: %s", what);
 }
 
-// The widths of the layers of a head, and whether it has a cross.
+// The widths of the layers of a head.
 bool read_widths(Bytes& data, Head& head, fhash_error& error) {
-    constexpr uint8_t CROSSED = 0x82;
-    constexpr int MAX_HIDDEN = 3, MAX_WIDTH = 64, MAX_CROSS_WIDTH = 14;
-    uint8_t first;
+    constexpr int MAX_HIDDEN = 3, MAX_WIDTH = 64;
+    uint8_t count;
     const uint8_t* widths;
-    if (!data.number(first)) return no_head(error, "it is cut");
-    head.cross = first == CROSSED;
-    const int count = head.cross ? 2 : first;
-    if (count < 1 || count > MAX_HIDDEN || !data.take((size_t)count, widths))
+    if (!data.number(count)) return no_head(error, "it is cut");
+    if (count < 1 || count > MAX_HIDDEN || !data.take(count, widths))
         return no_head(error, "its hidden layers");
     head.widths = {28};
     for (int i = 0; i < count; i++) {
-        const int most = head.cross && i == 0 ? MAX_CROSS_WIDTH : MAX_WIDTH;
-        if (widths[i] < 1 || widths[i] > most) return no_head(error, "its widths");
+        if (widths[i] < 1 || widths[i] > MAX_WIDTH) return no_head(error, "its widths");
         head.widths.push_back(widths[i]);
     }
     head.widths.push_back(1);
@@ -298,8 +294,7 @@ bool read_layers(Bytes& data, Head& head, float sigma, fhash_error& error) {
     int64_t weight_count = 0;
     std::vector<int64_t> sizes;
     for (int64_t l = 0; l < layers; l++) {
-        const int64_t repeats = head.cross && l == 1 ? 9 : 1;
-        sizes.push_back(repeats * head.widths[(size_t)l] * head.widths[(size_t)l + 1]);
+        sizes.push_back(head.widths[(size_t)l] * head.widths[(size_t)l + 1]);
         weight_count += sizes.back();
         const float unit_out = l + 1 == layers ? sigma : 128.0f;
         for (int64_t i = 0; i < head.widths[(size_t)l + 1]; i++) {

@@ -31,7 +31,6 @@ struct AxisTransform {
 
 // A head as the kernel takes it (head.cpp).
 struct Head {
-    bool cross;
     std::vector<int64_t> widths;
     std::vector<float> weights, biases, scales;
     float constants[4];  // low, high, 1 / (2 sigma), 1024 over the length of the range

@@ -409,7 +409,7 @@ bool apply_head(const fhash_context& context, const Head& head, const float* in,
         codes[(size_t)part] = fhash_head_apply(
             in, shape.data(), rows * part / parts, rows * (part + 1) / parts, head.layers(),
             head.widths.data(), head.weights.data(), head.biases.data(), head.scales.data(),
-            head.constants, head.cross, 0, out);
+            head.constants, 0, out);
     };
     together((int)parts, run);
     for (const int64_t code : codes)

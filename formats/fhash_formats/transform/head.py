@@ -36,13 +36,6 @@ OFFSETS: tuple[tuple[int, int, int, int], ...] = (
 """Offsets along (t, z, y, x) from a voxel to its 26 neighbours, in the order of the inputs."""
 
 
-CROSS = ((0, 0, 0, 0), *OFFSETS[:8])
-"""Offsets to the nine voxels of a cross, in order.
-
-They are the voxel itself, then the ones before and after it along each axis.
-"""
-
-
 INPUTS = len(OFFSETS) + 2
 """Number of inputs: one per neighbour, and two functions of the voxel's own value."""
 
@@ -130,8 +123,6 @@ MAX_HIDDEN = 3
 """Most hidden layers."""
 MAX_WIDTH = 64
 """Most outputs of a hidden layer; up to that, sums stay exact in float32."""
-MAX_CROSS_WIDTH = 14
-"""Most outputs of the first layer before a cross; sums over nine times as many stay exact."""
 MAX_BIAS = 127
 """Largest magnitude of a quantised bias (8 bits)."""
 
@@ -142,25 +133,10 @@ _INPUT_UNIT = 512.0
 """Integer steps of an input in 1."""
 _ACTIVATION_UNIT = 128.0
 """Integer steps of an activation in 1."""
-_CROSSED = 0x82
-"""First byte of a packed head with a cross, in place of the number of its hidden layers (two)."""
 _WIDEST_LANES = 0
 """Lanes with which the native library computes (head.cpp): the widest that this machine has."""
 _MAX_WEIGHT_BYTES = 3
 """Bytes that a weight takes at most (22 bits), which bounds the work on hostile bytes."""
-
-
-def layer_inputs(hidden: Sequence[int], cross: bool) -> list[int]:
-    """The number of inputs of each layer, the last one included.
-
-    Args:
-        hidden: widths of the hidden layers.
-        cross: whether the second layer sees the first one's outputs over the cross.
-    """
-    inputs = [INPUTS, *hidden]
-    if cross and hidden:
-        inputs[1] *= len(CROSS)
-    return inputs
 
 
 Scaled = tuple[npt.NDArray[np.int8], float]
@@ -227,26 +203,22 @@ class NeighbourHead:
         sigma: RMS error of the decoded values, > 0, a float32 value in data units.
         low: lower end of the clip range, a float32 value in data units.
         high: upper end of the clip range, likewise.
-        cross: whether the second of two hidden layers sees the first one's outputs over the cross.
-            Its weights are (out, 9 * in), the nine of each input together.
     """
 
     layers: tuple[Layer, ...]
     sigma: float
     low: float
     high: float
-    cross: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= len(self.layers) <= MAX_HIDDEN + 1:
             raise InputError(
                 f"a head has 1 to {MAX_HIDDEN} hidden layers, not {len(self.layers) - 1}"
             )
-        if self.cross and len(self.layers) != 3:
-            raise InputError(f"a head with a cross has 2 hidden layers, not {len(self.layers) - 1}")
-        inputs = layer_inputs(self.hidden, self.cross)
+        inputs = (INPUTS, *self.hidden)
         for number, layer in enumerate(self.layers):
-            _check_layer(number, layer, inputs[number], self._most_outputs(number))
+            most_outputs = 1 if number == len(self.hidden) else MAX_WIDTH
+            _check_layer(number, layer, inputs[number], most_outputs)
         constants = (self.sigma, self.low, self.high)
         if any(not np.isfinite(value) or float(np.float32(value)) != value for value in constants):
             raise InputError(
@@ -258,12 +230,6 @@ class NeighbourHead:
                 f"a head needs sigma in {SIGMA_RANGE} and low <= high, "
                 f"not {self.sigma}, {self.low}, {self.high}"
             )
-
-    def _most_outputs(self, number: int) -> int:
-        """Most outputs of a layer."""
-        if number == len(self.layers) - 1:
-            return 1
-        return MAX_CROSS_WIDTH if self.cross and number == 0 else MAX_WIDTH
 
     @property
     def hidden(self) -> tuple[int, ...]:
@@ -328,7 +294,6 @@ class NeighbourHead:
                 *part,
                 len(self.layers),
                 *(array.ctypes.data_as(ctypes.c_void_p) for array in arguments),
-                self.cross,
                 _WIDEST_LANES,
                 ctypes.c_void_p(out.ctypes.data),
             )
@@ -356,14 +321,13 @@ class NeighbourHead:
     def to_bytes(self) -> bytes:
         """The packed head; `from_bytes` is the inverse. All numbers are little-endian.
 
-        First u8 the number of hidden layers, or 0x82 for two and a cross between them, and u8 the
-        width of each; float32 sigma, low, high; per layer float16 the scales of weights and biases,
-        and u8 the spread; then the biases of all layers as int8; then the weights of all layers,
-        row by row, in one big integer.
+        First u8 the number of hidden layers, and u8 the width of each; float32 sigma, low, high;
+        per layer float16 the scales of weights and biases, and u8 the spread; then the biases of
+        all layers as int8; then the weights of all layers, row by row, in one big integer.
         """
         spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
         fields = [
-            bytes([_CROSSED if self.cross else len(self.hidden), *self.hidden]),
+            bytes([len(self.hidden), *self.hidden]),
             struct.pack("<3f", self.sigma, self.low, self.high),
         ]
         for layer, spread in zip(self.layers, spreads, strict=True):
@@ -389,18 +353,13 @@ class NeighbourHead:
     @classmethod
     def _read(cls, data: bytes) -> NeighbourHead:
         """The head in some bytes. Raises ValueError, IndexError or struct.error for others."""
-        cross = data[0] == _CROSSED
-        count = 2 if cross else data[0]
+        count = data[0]
         if not 1 <= count <= MAX_HIDDEN:
             raise ValueError(f"{count} hidden layers")
         widths = [*data[1 : 1 + count], 1]
-        if (
-            len(widths) != count + 1
-            or not all(1 <= width <= MAX_WIDTH for width in widths)
-            or (cross and widths[0] > MAX_CROSS_WIDTH)
-        ):
+        if len(widths) != count + 1 or not all(1 <= width <= MAX_WIDTH for width in widths):
             raise ValueError(f"layers of widths {widths}")
-        inputs = layer_inputs(widths[:-1], cross)
+        inputs = [INPUTS, *widths[:-1]]
         sigma, low, high = struct.unpack_from("<3f", data, 1 + count)
         position = 13 + count
         scales = [
@@ -428,7 +387,7 @@ class NeighbourHead:
             )
         if state != 1:
             raise ValueError("its weights do not end where their code ends")
-        return cls(layers=tuple(layers), sigma=sigma, low=low, high=high, cross=cross)
+        return cls(layers=tuple(layers), sigma=sigma, low=low, high=high)
 
 
 def _check_layer(number: int, layer: Layer, inputs: int, most_outputs: int) -> None:

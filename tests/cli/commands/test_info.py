@@ -37,7 +37,7 @@ def added(line: str) -> bool:
         ("compact-psnr", ["density, fhash.transform,", "none: the values"]),
         ("compact-mask", ["in the tiles of density"]),
         (
-            "compact-cross",
+            "compact-linear",
             ["; packed in the codec of density", "in the tiles of density"],
         ),
     ],

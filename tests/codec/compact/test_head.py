@@ -170,7 +170,7 @@ def test_inputs_are_those_that_the_head_computes(low: float, high: float, sigma:
         found = batches(pairs, drawn, np.random.default_rng(5), value_range)
         expected = []
         for pair, voxels in zip(pairs, drawn, strict=True):
-            head = Head([], False, np.float32(sigma), *ends)
+            head = Head([], np.float32(sigma), *ends)
             values = clip(pair.decoded, *ends)
             planes = inputs_of(values, head)
             expected.append(np.array(planes)[:, *voxels.places])

@@ -394,18 +394,19 @@ PARTS = {
 }
 
 
-def settings_of(cross: bool) -> object:
-    hidden = (5, 4) if cross else (12, 8)
+def with_head(hidden: tuple[int, ...] = (12, 8)) -> TileSettings:
     spec = spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), WHOLE)
-    head = random_head(hidden, cross=cross, spread=16.0)
+    head = random_head(hidden, spread=16.0)
     return replace(SETTINGS, transform=spec, quantum=0.0, head=head, clip=True)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64", "int16"])
-@pytest.mark.parametrize("cross", [False, True])
+@pytest.mark.parametrize("hidden", [(12, 8), (5,)])
 @pytest.mark.parametrize("name", list(PARTS))
-def test_a_part_has_the_bits_of_the_whole(name: str, cross: bool, dtype: str) -> None:
-    settings, values = settings_of(cross), wave(WHOLE, dtype)
+def test_a_part_has_the_bits_of_the_whole(
+    name: str, hidden: tuple[int, ...], dtype: str
+) -> None:
+    settings, values = with_head(hidden), wave(WHOLE, dtype)
     data = encode_tile(values, settings).data
     whole = decode_tile(data, WHOLE, dtype, settings)
     part = tuple(slice(*span) for span in PARTS[name])
@@ -422,7 +423,7 @@ def test_a_part_has_the_bits_of_the_whole(name: str, cross: bool, dtype: str) ->
 
 
 def test_tiles_with_more_than_a_head_are_decoded_whole() -> None:
-    settings, values = settings_of(cross=False), wave(WHOLE)
+    settings, values = with_head(), wave(WHOLE)
     part = tuple(slice(*span) for span in PARTS["corner"])
     holes = values.copy()
     holes[0, 1, 2, 3] = np.nan
@@ -441,10 +442,21 @@ def test_tiles_with_more_than_a_head_are_decoded_whole() -> None:
 
 
 def test_a_large_part_is_decoded_whole() -> None:
-    settings = settings_of(cross=False)
+    settings = with_head()
     data = encode_tile(wave(WHOLE), settings).data
     frame = (slice(0, 1), *(slice(0, n) for n in WHOLE[1:]))
     assert uncorrected(data, WHOLE, "float32", settings, frame) is None
+
+
+@pytest.mark.parametrize("first", [0, 4, 0x82])
+def test_a_head_of_other_hidden_layers_is_damage_in_a_tile(first: int) -> None:
+    settings = with_head()
+    assert settings.head is not None
+    data = encode_tile(wave(WHOLE), settings, Coding(own_settings=True)).data
+    at = data.index(settings.head.to_bytes())
+    changed = resealed(data[:at] + bytes([first]) + data[at + 1 :])
+    with pytest.raises(DamagedFileError, match="head: its hidden layers"):
+        decode_tile(changed, WHOLE, "float32", settings)
 
 
 SHAPE_MASKED = (2, 3, 12, 17)

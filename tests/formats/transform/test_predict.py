@@ -530,7 +530,7 @@ CHANGES: list[dict[str, Any]] = [
     {"mask": MaskLevels(edges=(-1.5, 3.0), scores=(1, 0, 4095), others=(7, 8, 9), reach=64)},
     {"clip": True, "labels": True},
     {"trellis": True, "offsets": (-5, -1, 0, 0, 1, -127)},
-    {"head": random_head((3, 4), cross=True)},
+    {"head": random_head((3, 4))},
     {"predictor": predictor_of((1, 2, 2, 2), (0, 3, 1, 2), 1, step=0.25)},
     {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), tiles.SHAPE, 0.1)},
     {"origin": -(1 << 63), "low": -(1 << 62), "high": (1 << 62) + 1},

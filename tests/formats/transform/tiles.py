@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from specs import spec_of
 
 from fhash_formats.native import crc32c
-from fhash_formats.transform.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
+from fhash_formats.transform.head import INPUTS, MAX_WEIGHT, Layer, NeighbourHead
 from fhash_formats.transform.predict import Predictor, passes_of
 from fhash_formats.transform.spec import MaskLevels
 from fhash_formats.transform.tile import Coding, encode_tile, exact_tile
@@ -122,12 +123,11 @@ def random_head(
     low: float = LOW,
     high: float = HIGH,
     spread: float = 8.0,
-    cross: bool = False,
 ) -> NeighbourHead:
     """A head of random weights, whose standard deviation is `spread`."""
     random = np.random.default_rng(seed)
     layers = []
-    for inputs, outputs in zip(layer_inputs(hidden, cross), [*hidden, 1], strict=True):
+    for inputs, outputs in pairwise((INPUTS, *hidden, 1)):
         weights = np.rint(
             np.clip(random.normal(size=(outputs, inputs)) * spread, -MAX_WEIGHT, MAX_WEIGHT)
         ).astype(np.int8)
@@ -140,9 +140,7 @@ def random_head(
                 bias_scale=float(np.float16(0.003)),
             )
         )
-    return NeighbourHead(
-        layers=tuple(layers), sigma=float(np.float32(sigma)), low=low, high=high, cross=cross
-    )
+    return NeighbourHead(layers=tuple(layers), sigma=float(np.float32(sigma)), low=low, high=high)
 
 
 def random_tile(shape: tuple[int, ...], seed: int = 1) -> Floats:

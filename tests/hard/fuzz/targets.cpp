@@ -165,11 +165,9 @@ float scale_of(Reader& in) {
 }
 
 void head(Reader& in) {
-    const bool cross = in.byte() & 1;
-    const int64_t hidden = cross ? 2 : in.within(1, 3);
+    const int64_t hidden = in.within(1, 3);
     std::vector<int64_t> widths{28};
-    for (int64_t layer = 0; layer < hidden; layer++)
-        widths.push_back(in.within(1, cross && layer == 0 ? 14 : 64));
+    for (int64_t layer = 0; layer < hidden; layer++) widths.push_back(in.within(1, 64));
     widths.push_back(1);
     const std::vector<int64_t> shape = {in.within(1, 5), in.within(1, 4), in.within(1, 4),
                                         in.within(1, 140)};
@@ -180,8 +178,7 @@ void head(Reader& in) {
     std::vector<float> weights, biases, scales;
     const std::vector<std::uint8_t> seed = in.numbers<std::uint8_t>(64);
     for (int64_t layer = 0; layer <= hidden; layer++) {
-        const int64_t inputs =
-            cross && layer == 1 ? 9 * widths[1] : widths[static_cast<std::size_t>(layer)];
+        const int64_t inputs = widths[static_cast<std::size_t>(layer)];
         const int64_t outputs = widths[static_cast<std::size_t>(layer) + 1];
         const float unit = layer == hidden ? sigma : 128.0F, bias = scale_of(in);
         scales.push_back(scale_of(in) / (layer ? 128.0F : 512.0F) * unit);
@@ -205,8 +202,7 @@ void head(Reader& in) {
     const int64_t rows = shape[1] * shape[2], first = in.within(0, rows);
     const int64_t last = in.within(first, rows), lanes = in.within(0, 5);
     fhash_head_apply(values.data(), shape.data(), first, last, hidden + 1, widths.data(),
-                     weights.data(), biases.data(), scales.data(), constants, cross, lanes,
-                     out.data());
+                     weights.data(), biases.data(), scales.data(), constants, lanes, out.data());
 }
 
 auto free_of(const float*) { return fhash_free_f32; }

@@ -16,26 +16,18 @@ std::string lattice_table(size_t level) { return "tables/level_" + std::to_strin
 
 struct Widths {
     std::vector<int64_t> hidden;
-    bool cross = false;
 
     size_t layers() const { return hidden.size() + 1; }
     int64_t outputs(size_t layer) const { return layer < hidden.size() ? hidden[layer] : 1; }
-    int64_t inputs(size_t layer) const {
-        const int64_t before = layer ? hidden[layer - 1] : 28;
-        return cross && layer == 1 ? 9 * before : before;
-    }
+    int64_t inputs(size_t layer) const { return layer ? hidden[layer - 1] : 28; }
 };
 
 bool read_widths(const Record& head, Widths& widths, fhash_error& error) {
-    const Json hidden = head.find("hidden"), cross = head.find("cross");
+    const Json hidden = head.find("hidden");
     const size_t count = yyjson_is_arr(hidden) ? yyjson_arr_size(hidden) : 0;
     if (!head.need(count >= 1 && count <= 3, "hidden", "1 to 3 widths", error)) return false;
     widths.hidden.resize(count);
-    widths.cross = yyjson_is_true(cross);
-    return head.integers("hidden", count, 1, 64, widths.hidden.data(), error) &&
-           head.need(yyjson_is_bool(cross), "cross", "true or false", error) &&
-           head.need(!widths.cross || (count == 2 && widths.hidden[0] <= 14), "hidden",
-                     "2 widths of a head with a cross, the first up to 14", error);
+    return head.integers("hidden", count, 1, 64, widths.hidden.data(), error);
 }
 
 // All values of an array as whole multiples of its attribute `scale`.
@@ -76,7 +68,6 @@ bool read_head(fhash_file& file, const Variable& variable, Head& head, fhash_err
                         double(float(high)) == high;
     if (!narrow || !(sigma >= 0x1p-100 && sigma <= 0x1p100) || low > high)
         return fail(error, FHASH_ERROR_DAMAGED, "the head of a plain file has a wrong range");
-    head.cross = widths.cross;
     head.widths = {28};
     for (size_t layer = 0; layer < widths.layers(); layer++) {
         const std::string number = std::to_string(layer + 1);
