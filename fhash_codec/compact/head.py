@@ -36,8 +36,11 @@ from fhash_formats.transform.values import cast
 GAIN_BY_WIDTHS = {(12, 8): 1.0, (24, 16): 1.2, (48, 16): 1.35}
 """Gain in dB of an MLP by the widths of its hidden layers, as a multiple of that of the first."""
 MOST_WIDTHS = {"fast": 1, "balanced": 2, "small": 3}
-"""Number of these that are considered, by the wish for access: decoding takes 5, 13 and 25 ns more for
-each vertex (AVX-512; 8, 20 and 45 with AVX2), where SPERR takes some 40."""
+"""Number of these that are considered, by the wish for access.
+
+Decoding takes 5, 13 and 25 ns more for each vertex (AVX-512; 8, 20 and 45 with AVX2), where SPERR
+takes some 40.
+"""
 LEAST_GAIN = 0.3
 """Gain in dB of least squares below which nothing is trained: at 0.15 a training saved up to 4 % in
 two to three times the seconds, from 0.6 on 4 to 40 %."""
