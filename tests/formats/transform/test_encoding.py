@@ -403,9 +403,7 @@ def with_head(hidden: tuple[int, ...] = (12, 8)) -> TileSettings:
 @pytest.mark.parametrize("dtype", ["float32", "float64", "int16"])
 @pytest.mark.parametrize("hidden", [(12, 8), (5,)])
 @pytest.mark.parametrize("name", list(PARTS))
-def test_a_part_has_the_bits_of_the_whole(
-    name: str, hidden: tuple[int, ...], dtype: str
-) -> None:
+def test_a_part_has_the_bits_of_the_whole(name: str, hidden: tuple[int, ...], dtype: str) -> None:
     settings, values = with_head(hidden), wave(WHOLE, dtype)
     data = encode_tile(values, settings).data
     whole = decode_tile(data, WHOLE, dtype, settings)
