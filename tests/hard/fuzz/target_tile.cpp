@@ -84,10 +84,6 @@ void look(Reader& in, const fhash_tile& tile) {
     }
     is_told(fhash_tile_fill(context(), &tile, marks.data(), finite.data(), in.byte() % 3,
                             values.data(), nullptr));
-    std::vector<float> some(values.size());
-    for (float& value : some) value = in.finite<float>();
-    double results[2];
-    is_told(fhash_tile_foretell(context(), &tile, some.data(), 1.0, 0.1, results, nullptr));
     std::vector<std::int32_t> whole = integers(in, n);
     for (std::int32_t& each : whole) each %= 1 << 27;
     std::int64_t size;
