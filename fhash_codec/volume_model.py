@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from math import floor, prod
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box, Mlp, Spans, Table
-from fhash_codec.compact.model import CompactModel
+from fhash_codec.compact.model import CompactModel, equal_places
 from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
 from fhash_codec.header import metadata_of
@@ -271,22 +271,18 @@ def interpolable(
         ],
         axis=0,
     )
-    for step, group in _groups_of_one_occupancy(steps, keys):
-        chosen = np.flatnonzero(inside & group)
-        if chosen.size:
-            inside[chosen] = _cells_occupied([p[chosen] for p in space], step, occupancy)
+    candidates = np.flatnonzero(inside)
+    # Points between the same steps and the same key frames share an occupancy.
+    for group in equal_places(_between(steps[candidates]), _between(keys[candidates])):
+        chosen = candidates[group]
+        step = float(steps[chosen[0]])
+        inside[chosen] = _cells_occupied([p[chosen] for p in space], step, occupancy)
     return inside
 
 
-def _groups_of_one_occupancy(steps: Positions, keys: Positions) -> Iterator[tuple[float, Mask]]:
-    """Points between the same steps and the same key frames: a step of theirs, and their mask."""
-    between = np.stack([np.floor(steps), np.ceil(steps), np.floor(keys), np.ceil(keys)])
-    if len(steps) and (between == between[:, :1]).all():
-        yield float(steps[0]), np.ones(len(steps), np.bool_)
-        return
-    _, first, group = np.unique(between, axis=1, return_index=True, return_inverse=True)
-    for number, point in enumerate(first):
-        yield steps[point], group == number
+def _between(positions: Positions) -> npt.NDArray[np.int64]:
+    """Numbers (n,) that are equal for positions on one whole number, or between the same two."""
+    return (np.floor(positions) + np.ceil(positions)).astype(np.int64)
 
 
 def _cells_occupied(

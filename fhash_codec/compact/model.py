@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cached_property, lru_cache, reduce
 from itertools import product
-from math import prod
 from typing import Any
 
 import numpy as np
@@ -253,6 +252,89 @@ class PlainArray:
         return corrected(base, corrections)
 
 
+BLOCK = 1 << 13
+"""Points whose corners are gathered at a time: they take 1 MiB, which stays in the cache."""
+
+Cells = tuple[npt.NDArray[np.intp], Double, list[Double]]
+"""Numbers (n,) of points, the corners (2, 2, 2, 2, n) around each, by t, z, y and x, and the shares
+(n,) of the upper corners along each axis."""
+
+
+def equal_places(*numbers: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.intp]]:
+    """Yield the places of equal numbers (n,), none negative, by ascending numbers.
+
+    Of several arrays all have to be equal, and the first counts most for the order.
+    """
+    if not numbers[0].size:
+        return
+    # numpy sorts numbers of 16 bits by counting them.
+    small = [each.astype(np.min_scalar_type(each.max())) for each in numbers]
+    order = np.lexsort(small[::-1])
+    changes = np.logical_or.reduce([np.diff(each[order]) != 0 for each in small])
+    yield from np.split(order, np.flatnonzero(changes) + 1)
+
+
+def _before(positions: Any, length: int) -> npt.NDArray[np.int64]:
+    """Return the vertex before each position on an axis; the last one but one for the last."""
+    vertices = np.floor(positions).astype(np.int64)
+    return np.asarray(np.clip(vertices, 0, max(length - 2, 0)))
+
+
+def _corners(
+    frames: list[npt.NDArray[Any]], space: list[Double], region: Box, lengths: list[int]
+) -> tuple[Double, list[Double]]:
+    """Return the corners (2, 2, 2, 2, points) around points, and their shares along z, y and x.
+
+    frames: values (z, y, x) of a region of a box of these lengths at both steps around the points.
+    """
+    low = [_before(p, n) for p, n in zip(space, lengths, strict=True)]
+    shares = [p - i for p, i in zip(space, low, strict=True)]
+    _, rows, row = region.shape
+    strides = (rows * row, row, 1)
+    first = sum(
+        (i - start) * stride for i, start, stride in zip(low, region.first, strides, strict=True)
+    )
+    # On an axis of a single vertex that one is before and behind every point.
+    ahead = [stride if n > 1 else 0 for n, stride in zip(lengths, strides, strict=True)]
+    corners = np.empty((2, 2, 2, 2, space[0].size))
+    for z, y, x in product((0, 1), repeat=3):
+        places = first + (z * ahead[0] + y * ahead[1] + x * ahead[2])
+        for t, frame in enumerate(frames):
+            corners[t, z, y, x] = frame.reshape(-1)[places]
+    return corners, shares
+
+
+def _interpolated(corners: Double, shares: list[Double]) -> Double:
+    """Return the values (n,) between corners (2, 2, 2, 2, n)."""
+    values = np.zeros(corners.shape[-1])
+    for corner in _weighed(corners, shares, range(4)).reshape(16, -1):
+        values += corner
+    return values
+
+
+def _slopes(corners: Double, shares: list[Double]) -> Double:
+    """Return the derivatives (n, 4) by t, z, y and x between corners (2, 2, 2, 2, n)."""
+    slopes = np.empty((corners.shape[-1], 4))
+    for axis in range(4):
+        weighed = _weighed(corners, shares, [other for other in range(4) if other != axis])
+        # One after the other: numpy would add up those of a single point in another order.
+        low, high = (
+            reduce(np.add, np.take(weighed, side, axis=axis).reshape(8, -1)) for side in (0, 1)
+        )
+        slopes[:, axis] = high - low
+    return slopes
+
+
+def _weighed(corners: Double, shares: list[Double], axes: Iterable[int]) -> Double:
+    """Return corners (2, 2, 2, 2, n) times their weights, which are those along some axes."""
+    weights = np.ones(1)
+    for axis in axes:
+        sides = np.stack([1 - shares[axis], shares[axis]])
+        weights = weights * np.expand_dims(sides, [other for other in range(4) if other != axis])
+    # A corner without weight counts for nothing, also where it is not finite.
+    return np.where(weights == 0, 0.0, weights * corners)
+
+
 class CompactModel:
     """A `VolumeModel` (volume_model.py) of a compact file.
 
@@ -360,67 +442,50 @@ class CompactModel:
 
         steps, space: steps and (z, y, x) of the points, in vertices of the box, all inside.
         """
-        return self._interpolated(steps, space)[0]
+        values = np.empty(steps.size)
+        for chosen, corners, shares in self._cells(steps, space):
+            values[chosen] = _interpolated(corners, shares)
+        return values
 
     def sample_with_gradient(self, steps: Double, space: list[Double]) -> tuple[Double, Double]:
         """Return the values at points, and their derivatives (points, 4) by step, z, y and x.
 
         On the border of two cells the derivatives are those of the cell after it.
         """
-        values, corners, weights = self._interpolated(steps, space)
-        slopes = np.empty((values.size, 4))
-        for axis in range(4):
-            others = [a for a in range(4) if a != axis]
-            factor = np.ones((2, 2, 2, 2, values.size))
-            for other in others:
-                shape = [1, 1, 1, 1, values.size]
-                shape[other] = 2
-                factor = factor * np.stack([1 - weights[other], weights[other]]).reshape(shape)
-            # A corner without weight counts for nothing, also where it is not finite.
-            weighted = np.where(factor == 0, 0.0, factor * corners)
-            low, high = (
-                np.take(weighted, side, axis=axis).reshape(-1, values.size).sum(axis=0)
-                for side in (0, 1)
-            )
-            slopes[:, axis] = high - low
+        values, slopes = np.empty(steps.size), np.empty((steps.size, 4))
+        for chosen, corners, shares in self._cells(steps, space):
+            values[chosen] = _interpolated(corners, shares)
+            slopes[chosen] = _slopes(corners, shares)
         return values, slopes
 
-    def _interpolated(
-        self, steps: Double, space: list[Double]
-    ) -> tuple[Double, Double, list[Double]]:
-        """Return the values at points, and what they are interpolated from.
+    def _cells(self, steps: Double, space: list[Double]) -> Iterator[Cells]:
+        """Yield points between the same two steps, and the cells around them, by ascending steps.
 
-        That is the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the
-        upper corners along each axis.
+        Each step is read once, the part of it that surrounds all points, and two are held.
         """
-        shape = self._array.shape
-        low = [
-            np.clip(np.floor(p).astype(np.int64), 0, max(n - 2, 0))
-            for p, n in zip([steps, *space], shape, strict=True)
-        ]
-        weights = [p - i for p, i in zip([steps, *space], low, strict=True)]
-        high = [np.minimum(i + 1, n - 1) for i, n in zip(low, shape, strict=True)]
-        corners = np.empty((2, 2, 2, 2, steps.size))
-        box = tuple(
-            (int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True)
+        count, *lengths = self._array.shape
+        around = Box.of(
+            (int(_before(p.min(), n)), min(int(_before(p.max(), n)) + 2, n))
+            for p, n in zip(space, lengths, strict=True)
         )
-        space_slices = tuple(slice(*span) for span in box)
-        for step in np.unique(np.concatenate([low[0], high[0]])):
-            stored = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
-            frame = self._without_infinities(stored)
-            for corner in product((0, 1), repeat=4):
-                at = [(high if up else low)[axis] for axis, up in enumerate(corner)]
-                chosen = at[0] == step
-                if chosen.any():
-                    where = tuple(at[axis + 1][chosen] - box[axis][0] for axis in range(3))
-                    corners[(*corner, chosen)] = frame[where]
-        values = np.zeros(steps.size)
-        for corner in product((0, 1), repeat=4):
-            factors = [weights[axis] if up else 1 - weights[axis] for axis, up in enumerate(corner)]
-            # A corner without weight counts for nothing, also where it is not finite.
-            weight = np.asarray(prod(factors))
-            values += np.where(weight == 0, 0.0, weight * corners[corner])
-        return values, corners, weights
+        before, frames = _before(steps, count), dict[int, npt.NDArray[Any]]()
+        for group in equal_places(before):
+            step = int(before[group[0]])
+            pair = (step, min(step + 1, count - 1))
+            frames = {n: frames[n] for n in pair if n in frames}
+            for n in pair:
+                if n not in frames:
+                    frames[n] = self._frame(n, around)
+            for start in range(0, group.size, BLOCK):
+                chosen = group[start : start + BLOCK]
+                places = [p[chosen] for p in space]
+                corners, shares = _corners([frames[n] for n in pair], places, around, lengths)
+                yield chosen, corners, [steps[chosen] - step, *shares]
+
+    def _frame(self, step: int, region: Box) -> npt.NDArray[Any]:
+        """Return the values (z, y, x) of a region at a step; raise what `read` raises."""
+        stored = self._array.read((slice(step, step + 1), *region.slices()))
+        return np.asarray(self._without_infinities(stored)[0])
 
     def _without_infinities(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return values of the table, which are finite or NaN; raise DamagedFileError otherwise."""

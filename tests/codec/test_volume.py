@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import pickle
+from itertools import product
+from math import floor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +15,12 @@ from numpy.testing import assert_array_equal
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, RegionError
+from fhash_codec.compact import model as compact_model
+from fhash_codec.compact.model import equal_places
 from fhash_codec.features.features import dilate
 from fhash_codec.measure.value_range import decoded_type
-from fhash_codec.volume import feature_names, holds_features_apart, only_features, rounded
+from fhash_codec.volume import Volume, feature_names, holds_features_apart, only_features, rounded
+from fhash_formats.container import StoredArray
 from fhash_formats.series import ArraySeries, Coordinate
 
 LOW, HIGH = "interval:0:0.2", "interval:0.8:1"
@@ -395,6 +401,151 @@ def test_no_value_leaves_the_range_of_the_series(tmp_path, dtype, promise) -> No
     for decoded in read:
         assert values.min() <= decoded.min()
         assert decoded.max() <= values.max()
+
+
+LATTICE = (5, 6, 7, 9)
+
+
+def waves(shape: tuple[int, ...] = LATTICE) -> np.ndarray:
+    """Values of order 100 with noise."""
+    t, z, y, x = np.indices(shape)
+    noise = np.random.default_rng(0).normal(size=shape)
+    return np.asarray(100 * np.sin(x / 3 + t / 2) * np.cos(y / 4) + 5 * z + noise)
+
+
+def gappy() -> np.ndarray:
+    """The waves without some values, each at one step alone."""
+    values = waves().astype(np.float32)
+    values[np.random.default_rng(1).random(LATTICE) < 0.02] = np.nan
+    return values
+
+
+LATTICES = {
+    "float32": (waves().astype(np.float32), {}),
+    "float64": (waves(), {}),
+    "int16": (waves().astype(np.int16), {}),
+    "gappy": (gappy(), {}),
+    "feature": (waves().astype(np.float32), {"features": ("interval:-20:200",), "dilation": 0}),
+    "labels": (np.rint(waves() / 40).astype(np.float32), {"max_error": 0.0}),
+    "one step": (waves((1, 6, 7, 9)), {}),
+    "flat": (waves((5, 6, 1, 9)), {}),
+}
+
+
+def points_in(shape: tuple[int, ...], count: int) -> list[np.ndarray]:
+    """Steps and positions z, y and x: anywhere, on vertices and faces, and outside the domain."""
+    random = np.random.default_rng(2)
+    points = [random.uniform(0, n - 1, count) for n in shape]
+    for along, n in zip(points, shape, strict=True):
+        whole = random.random(count) < 0.3
+        along[whole] = np.rint(along[whole])
+        along[:2] = 0, n - 1
+    for along, n in zip(points[1:], shape[1:], strict=True):
+        along[-20:] += random.uniform(-n, n, 20)
+    return points
+
+
+def between(values: np.ndarray, point: list[float]) -> float:
+    """The value at a point between vertices (t, z, y, x); those without weight do not matter."""
+    low = [min(floor(p), max(n - 2, 0)) for p, n in zip(point, values.shape, strict=True)]
+    total = 0.0
+    for corner in product((0, 1), repeat=4):
+        weight = 1.0
+        for p, i, up in zip(point, low, corner, strict=True):
+            weight *= p - i if up else 1 - (p - i)
+        if weight:
+            total += weight * float(
+                values[tuple(i + up for i, up in zip(low, corner, strict=True))]
+            )
+    return total
+
+
+@pytest.fixture(scope="module", params=LATTICES)
+def lattice(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    values, settings = LATTICES[request.param]
+    path = tmp_path_factory.mktemp("points") / "a.fhz"
+    bound = {"effort": 1, "tile": "2x3x4x4", "max_error": 0.5}
+    fhash_codec.encode(values, path, EncodeConfig(**{**bound, **settings}))
+    return path
+
+
+def test_points_have_the_bits_of_a_sum_over_the_vertices_around_them(
+    lattice: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compact_model, "BLOCK", 50)
+    with fhash_codec.open(lattice) as volume:
+        values = volume[...].astype(volume.float_dtype)
+        t, z, y, x = points_in(volume.shape, 700)
+        found = volume.sample(t=t, z=z, y=y, x=x)
+        with_slopes, slopes = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
+        low, high = map(volume.float_dtype.type, volume.value_range.floats)
+    expected = np.full(t.size, np.nan, found.dtype)
+    for number, (step, *place) in enumerate(zip(t, z, y, x, strict=True)):
+        if all(0 <= p <= n - 1 for p, n in zip(place, values.shape[1:], strict=True)):
+            expected[number] = between(values, [step, *place])
+    assert_array_equal(found, np.clip(expected, low, high))
+    assert_array_equal(with_slopes, found)
+    assert 300 < np.isfinite(found).sum() <= 700 - 10
+    assert np.isfinite(slopes[np.isfinite(found)]).any(axis=0).all()
+
+
+def test_a_point_alone_has_the_bits_that_it_has_among_others(lattice: Path) -> None:
+    with fhash_codec.open(lattice) as volume:
+        points = dict(zip("tzyx", points_in(volume.shape, 60), strict=True))
+        together = volume.sample(**points, gradient=True)
+        for number in range(60):
+            one = {axis: along[number] for axis, along in points.items()}
+            assert_array_equal(volume.sample(**one), together[0][number])
+            for alone, among in zip(volume.sample(**one, gradient=True), together, strict=True):
+                assert_array_equal(alone, among[number])
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_each_step_is_read_once_and_each_point_gathered_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gradient: bool
+) -> None:
+    """The work grows with points plus steps, not with their product."""
+    path = tmp_path / "a.fhz"
+    config = EncodeConfig(effort=1, tile="1x3x4x4", max_error=0.5)
+    fhash_codec.encode(waves().astype(np.float32), path, config)
+    steps, decoded, asked, gathered = [], [], [], []
+
+    def recorded(owner: Any, name: str, told: list[Any], what: Any) -> None:
+        original = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *args: told.append(what(*args)) or original(*args))
+
+    def indices_of(array: StoredArray, index: Any, *_: Any) -> Any:
+        return index
+
+    recorded(StoredArray, "_decode", decoded, indices_of)
+    recorded(StoredArray, "read", steps, lambda _, region: range(5)[region[0]])
+    recorded(Volume, "occupancy", asked, lambda _, step, region: (floor(step), -floor(-step)))
+    recorded(compact_model, "_corners", gathered, lambda _, places, *rest: places[0].size)
+    monkeypatch.setattr(compact_model, "BLOCK", 64)
+    t, z, y, x = (
+        np.clip(p, 0, n - 1) for p, n in zip(points_in(LATTICE, 900), LATTICE, strict=True)
+    )
+    with fhash_codec.open(path) as volume:
+        volume.sample(t=t, z=z, y=y, x=x, gradient=gradient)
+    assert steps == [range(n, n + 1) for n in range(5)]
+    assert len(decoded) == len(set(decoded))
+    assert len(asked) == len(set(asked)) == 5 + 4
+    assert sum(gathered) == 900
+    assert max(gathered) == 64
+
+
+@pytest.mark.parametrize("most", [1, 200, 70_000, 1 << 40])
+def test_places_of_equal_numbers(most: int) -> None:
+    random = np.random.default_rng(3)
+    numbers = random.choice(random.integers(0, most, 9), 400)
+    others = random.integers(0, 2, 400)
+    seen = []
+    for places in equal_places(numbers, others):
+        seen.append((numbers[places[0]], others[places[0]]))
+        equal = (numbers == seen[-1][0]) & (others == seen[-1][1])
+        assert_array_equal(np.sort(places), np.flatnonzero(equal))
+    assert seen == sorted(set(zip(numbers, others, strict=True)))
+    assert list(equal_places(numbers[:0])) == []
 
 
 @pytest.fixture(scope="module")

@@ -88,7 +88,7 @@ error=math.floor(error) + 0.5 => error=math.floor(error) + 1.5
 promise-order fhash_codec/compact/encode.py
 min(psnr, other_psnr) < self => max(psnr, other_psnr) < self
 step-weight fhash_codec/compact/model.py
-weights = [p - i for p, i => weights = [i - p for p, i
+shares = [p - i for p, i => shares = [i - p for p, i
 level-of-two fhash_codec/paper/network.py
 if previous > fold else 2 => if previous >= fold else 2
 needed-corner fhash_codec/paper/storage.py
