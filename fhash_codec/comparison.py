@@ -62,6 +62,7 @@ class Report(Sizes):
     ssim: Annotated[float | None, "mean structural similarity over the coreset"]
     psnr_domain: Annotated[float | None, "dB over all, background outside the coreset"]
     epochs: Annotated[int, "of the training; 0 without one"]
+    saved: Annotated[float | None, "share of the bytes of the values that the MLP saves, about"]
     curve: Annotated[list[HistoryPoint], "course of the training"]
     shape: Annotated[list[int], "of the series, (t, z, y, x)"]
     key_frames: Annotated[list[int], "steps that were encoded"]
@@ -116,6 +117,7 @@ def report(
         "psnr_bulk": None if quality["bulk"] is None else quality["bulk"]["psnr"],
         "seconds": seconds,
         "epochs": info["training"]["epochs"],
+        "saved": info["training"].get("saved"),
         "curve": info["history"],
         "shape": info["domain"]["shape"],
         "key_frames": info["key_frames"],

@@ -394,9 +394,23 @@ def report_rows(
         ),
         *quality_rows(report, units),
         ("model", f"{model_name(published=published)}, {size_of_model}"),
+        *([] if published else [("MLP", trained(report))]),
         *loss_rows(report),
         ("time", f"{duration(report['seconds'])} of wall time, on {report['device']}"),
     ]
+
+
+def trained(report: Mapping[str, Any]) -> str:
+    """The training of the MLP, and what it saved; why there was none, where the stages tell."""
+    if report["saved"] is not None:
+        return (
+            f"trained for {report['epochs']} epochs; it saves about {report['saved']:.0%} of the"
+            " bytes of the values"
+        )
+    if report["epochs"]:
+        return f"trained for {report['epochs']} epochs; it saved too little, and was left out"
+    why = [each["why"] for each in report.get("stages", []) if each["stage"] == "head"]
+    return f"none: {why[0]}" if why else "none"
 
 
 def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

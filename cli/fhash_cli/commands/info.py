@@ -473,9 +473,12 @@ def _training(info: VolumeInfo) -> str:
         else f"; it diverged, and came to its end at a learning rate of {rate:.3g}"
     )
     unused = model["profile"] == "compact" and model["head"] is None
+    saved = "; it saved too little, and was left out" if unused else ""
+    if "saved" in training:
+        saved = f"; it saves about {training['saved']:.0%} of the bytes of the values"
     return (
         f"{steps}{training['epochs']} epochs{took} on {training['device']},"
-        f" seed {info['encoder']['seed']}{lowered}{'; the head was left out' if unused else ''}"
+        f" seed {info['encoder']['seed']}{lowered}{saved}"
     )
 
 

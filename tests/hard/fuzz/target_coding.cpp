@@ -393,9 +393,10 @@ struct Training {
 };
 
 struct Voxels {
-    int64_t sizes[6];  // batches, blocks, voxels of a block, voxels looked at, two widths
+    int64_t sizes[5];  // batches, blocks, voxels of a block, two widths
     std::vector<std::int16_t> inputs;
     std::vector<std::int32_t> targets, lowest, highest;
+    std::vector<float> weights;
 };
 
 Voxels make_voxels(Reader& in) {
@@ -405,11 +406,10 @@ Voxels make_voxels(Reader& in) {
     voxels.sizes[0] = in.within(1, 3);
     voxels.sizes[1] = in.within(1, widths % 64 ? 2 : 64);
     voxels.sizes[2] = BLOCK;
-    voxels.sizes[3] = in.byte() & 1 ? 9 : 1;
+    voxels.sizes[3] = in.within(1, most);
     voxels.sizes[4] = in.within(1, most);
-    voxels.sizes[5] = in.within(1, most);
     const int64_t blocks = voxels.sizes[0] * voxels.sizes[1];
-    voxels.inputs = repeated<std::int16_t>(in, blocks * INPUTS * voxels.sizes[3] * BLOCK);
+    voxels.inputs = repeated<std::int16_t>(in, blocks * INPUTS * BLOCK);
     for (std::int16_t& input : voxels.inputs)
         input = static_cast<std::int16_t>(std::clamp<int>(input, -MAX_INPUT, MAX_INPUT));
     const auto limited = [&](std::int32_t low, std::int32_t high) {
@@ -420,12 +420,13 @@ Voxels make_voxels(Reader& in) {
     voxels.targets = limited(-MAX_TARGET, MAX_TARGET);
     voxels.lowest = limited(-MAX_TARGET, 0);
     voxels.highest = limited(0, MAX_TARGET);
+    for (const std::uint8_t weight : repeated<std::uint8_t>(in, blocks * BLOCK))
+        voxels.weights.push_back(static_cast<float>(weight) / 255);
     return voxels;
 }
 
 Training make_training(Reader& in, const int64_t* sizes) {
-    const int64_t count = (INPUTS + 1) * sizes[4] + (sizes[4] * sizes[3] + 1) * sizes[5] +
-                          (sizes[5] + 1);
+    const int64_t count = (INPUTS + 1) * sizes[3] + (sizes[3] + 1) * sizes[4] + (sizes[4] + 1);
     Training training;
     const int exponent = static_cast<int>(in.within(-40, 6));
     for (const std::int8_t number : repeated<std::int8_t>(in, count))
@@ -439,9 +440,9 @@ Training make_training(Reader& in, const int64_t* sizes) {
 int64_t learn(const Voxels& voxels, Training& training, const double* rates, const double* roots,
               int64_t first, int64_t count, bool as_in_file) {
     return fhash_head_learn(voxels.inputs.data(), voxels.targets.data(), voxels.lowest.data(),
-                            voxels.highest.data(), voxels.sizes, training.parameters.data(),
-                            training.means.data(), training.squares.data(), rates, roots, first,
-                            count, as_in_file, 2);
+                            voxels.highest.data(), voxels.weights.data(), voxels.sizes,
+                            training.parameters.data(), training.means.data(),
+                            training.squares.data(), rates, roots, first, count, as_in_file, 2);
 }
 
 }  // namespace
@@ -468,8 +469,8 @@ void train(Reader& in) {
     require(training == again, "a training in two calls that gives other numbers");
     std::vector<int64_t> sums(static_cast<std::size_t>(voxels.sizes[0]), -1);
     require(fhash_head_errors(voxels.inputs.data(), voxels.targets.data(), voxels.lowest.data(),
-                              voxels.highest.data(), voxels.sizes, training.parameters.data(),
-                              as_in_file, sums.data()) == 0,
+                              voxels.highest.data(), voxels.weights.data(), voxels.sizes,
+                              training.parameters.data(), as_in_file, sums.data()) == 0,
             "errors that are refused");
     for (const int64_t sum : sums) require(sum >= 0, "a negative sum of squares");
 }

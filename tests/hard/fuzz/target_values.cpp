@@ -248,9 +248,7 @@ void inputs(Reader& in) {
     const std::vector<int64_t> shape = small_shape(in, 9);
     const std::vector<float> decoded = repeated<float>(in, volume(shape));
     const int64_t blocks = in.within(1, 3), count = in.within(0, 255) % (blocks * BLOCK + 1);
-    const int64_t looked_at = how & 1 ? 9 : 1;
     const std::vector<int64_t> neighbours = offsets_of(in, NEIGHBOURS, how & 2 ? 3 : 2);
-    const std::vector<int64_t> offsets = offsets_of(in, looked_at, 1);
     std::vector<int64_t> places, slots;
     for (std::size_t axis = 0; axis < 4; axis++) {
         const std::vector<std::uint8_t> some = repeated<std::uint8_t>(in, count);
@@ -263,10 +261,10 @@ void inputs(Reader& in) {
                                    static_cast<int>(in.within(-100, 99)));
     const float span = high - low;
     const double unit = span > 0 ? 1024.0F / span : 0.0F;
-    std::vector<std::int16_t> out(static_cast<std::size_t>(blocks * INPUTS * looked_at * BLOCK));
+    std::vector<std::int16_t> out(static_cast<std::size_t>(blocks * INPUTS * BLOCK));
     const int64_t code = fhash_head_inputs(
-        decoded.data(), shape.data(), places.data(), slots.data(), count, neighbours.data(),
-        offsets.data(), looked_at, low, high, 0.5F / sigma, unit, out.data());
+        decoded.data(), shape.data(), places.data(), slots.data(), count, neighbours.data(), low,
+        high, 0.5F / sigma, unit, out.data());
     bool near = true;
     for (const int64_t step : neighbours) near &= std::abs(step) <= 2;
     require(code == (near ? 0 : -1), "offsets that are refused, or are not");
