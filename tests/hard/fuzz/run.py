@@ -52,6 +52,7 @@ SOURCES = (
         "basis",
         "coding",
         "plan",
+        "planner",
         "differences",
         "tile",
         "choose",
