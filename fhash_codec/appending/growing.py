@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.head import JOINT
 from fhash_codec.compact.tiles import (
     Coding,
     Outcome,
@@ -520,7 +521,8 @@ def _coder(
     except DamagedFileError as error:
         raise DamagedFileError(f"{path}: {error}") from error
     weight = TRELLIS_WEIGHT if settings.trellis else WEIGHT
-    coding = coding_of(effort, fast=fast, weight=weight, filled=True, density=0)
+    joint = 0.0 if settings.head is None else JOINT
+    coding = coding_of(effort, fast=fast, weight=weight, filled=True, density=0, joint=joint)
     t, z, y, x = table.chunk_shape
     return LayerCoder(
         tile=(t, z, y, x), settings=settings, coding=goal.bounded(coding), dtype=table.dtype

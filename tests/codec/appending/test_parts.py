@@ -461,13 +461,14 @@ RECIPE = Recipe(
     tile=TILE_SERIES_PLAN, settings=SETTINGS, coding=Coding(error=0.05, rounds=2, density=4)
 )
 FILLED = replace(RECIPE, filling=(replace(SETTINGS, step=0.2), 2))
+TRAINED = replace(RECIPE, coding=replace(RECIPE.coding, aim=0.5, joint=1.2))
 
 
 def read(values) -> Recipe:
     return Recipe.from_dict(Record(values, "recipe."))
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, FILLED])
+@pytest.mark.parametrize("recipe", [RECIPE, FILLED, TRAINED])
 @pytest.mark.parametrize("layers", [range(0, 1), range(1, 3)])
 def test_some_layers_have_the_bytes_of_the_whole(recipe, layers) -> None:
     values = np.random.default_rng(0).random((5, 4, 6, 8), dtype=np.float32)
