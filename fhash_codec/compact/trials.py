@@ -526,7 +526,7 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
     return ""
 
 
-LEARNED = 6 << 20
+LEARNED = 12 << 20
 """Vertices of the tiles that are learned from, unless a single one has more."""
 
 
