@@ -128,12 +128,12 @@ def _coding(record: Record) -> Coding:
     density = record.integer("density", 0, max(DENSITIES))
     none_needed = density == 0 and options["filled"]
     record.need(none_needed or density in DENSITIES, "density", f"one of {list(DENSITIES)}")
-    numbers = {name: record.number(name) for name in ("weight", "aim", "joint")}
-    for name, number in numbers.items():
-        record.need(number >= 0, name, "a number from 0 on")
+    for name in ("weight", "aim", "joint"):
+        options[name] = record.number(name)
+        record.need(options[name] >= 0, name, "a number from 0 on")
     error = record.number_or_null("error")
     record.need(error is None or error >= 0, "error", "a number from 0 on, or null")
-    return Coding(error=error, density=density, **numbers, **options)
+    return Coding(error=error, density=density, **options)
 
 
 def code_layers(
