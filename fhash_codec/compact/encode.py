@@ -31,7 +31,7 @@ from fhash_codec.compact.goal import (
     search,
     with_step,
 )
-from fhash_codec.compact.head import MLP_BYTES
+from fhash_codec.compact.head import head_bytes
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
 from fhash_codec.compact.tiles import (
@@ -218,8 +218,8 @@ the seconds."""
 MARGIN = 0.005
 """dB added to the PSNR in the second pass; four times as much in each further one."""
 SURE = 0.03
-"""Share of the bytes from which on nobody doubts that an MLP saves some: below it, the tiles are
-coded without one as well."""
+"""Share of the bytes from which on it is sure that an MLP saves some: below it, the tiles are coded
+without one as well."""
 EXCESS_OF_MLP = 0.2
 """Excess in dB that is worth another pass with an MLP, which takes twice the time and saves 1 % of
 the bytes."""
@@ -281,7 +281,7 @@ def code_series(
         doubtful = coding_plan.saved is not None and coding_plan.saved < SURE
         if plain is not None and doubtful and table.plan.settings.head is not None:
             other = coded(plain)
-            if other.outcome.size < table.outcome.size + head_bytes(table):
+            if other.outcome.size < table.outcome.size + head_bytes(table.plan.settings.head):
                 table = other
         if _is_exact_by_chance(table, goal):
             blocks = coding_plan.blocks.retile(coding_plan.blocks.shape)
@@ -486,13 +486,9 @@ def _head_holds(table: CodedTable, aim: _Aim, code_all: CodeAll) -> bool:
     with stage("coding", "gain of the MLP in all tiles"):
         without = code_all(table.plan.plain).outcome
     gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
-    return without.size * 2 ** (gain / EXCHANGE) > table.outcome.size + head_bytes(table)
-
-
-def head_bytes(table: CodedTable) -> int:
-    """Return the bytes that the MLP of a table adds to the file, if it has one."""
-    head = table.plan.settings.head
-    return 0 if head is None else len(head.to_bytes()) + MLP_BYTES
+    return without.size * 2 ** (gain / EXCHANGE) > table.outcome.size + head_bytes(
+        table.plan.settings.head
+    )
 
 
 def _simpler_plans(coding_plan: CodingPlan) -> Iterator[CodingPlan]:

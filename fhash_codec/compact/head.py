@@ -36,7 +36,7 @@ from fhash_formats.transform.values import cast
 GAIN_BY_WIDTHS = {(12, 8): 1.0, (24, 16): 1.2, (48, 16): 1.35}
 """Gain in dB of an MLP by the widths of its hidden layers, as a multiple of that of the first."""
 MOST_WIDTHS = {"fast": 1, "balanced": 2, "small": 3}
-"""Number of these that are considered, by the wish for access.
+"""Number of these that are considered, by the access.
 
 Decoding takes 5, 13 and 25 ns more for each vertex (AVX-512; 8, 20 and 45 with AVX2), where SPERR
 takes some 40.
@@ -101,7 +101,7 @@ def likely_widths(size: float, gain: float, access: str) -> Widths:
 
     size: bytes of the coded tiles.
     gain: expected gain in dB of the first of `GAIN_BY_WIDTHS`.
-    access: the wish, a name of `MOST_WIDTHS`.
+    access: a name of `MOST_WIDTHS`.
     """
 
     def saved(of: Widths) -> float:
@@ -165,9 +165,9 @@ class _Pass(NamedTuple):
     """Part of its correction that values are coded less by."""
 
 
-def own_bytes(trained: TrainedHead) -> int:
-    """Return the bytes that an MLP adds to the file."""
-    return len(trained.head.to_bytes()) + MLP_BYTES
+def head_bytes(head: NeighbourHead | None) -> int:
+    """Return the bytes that an MLP adds to the file; 0 without one."""
+    return 0 if head is None else len(head.to_bytes()) + MLP_BYTES
 
 
 def choose_head(
@@ -183,10 +183,11 @@ def choose_head(
     """
     settings, size = attempt.settings, attempt.outcome.size
     widths = likely_widths(size, GAIN_OF_MLP * foretold, task.config.access)
-    updates, passes = training_length(task, widths)
-    with stage("head", f"{updates} updates, {passes} passes; least squares gain {foretold:.2f} dB"):
+    lengths = training_lengths(task, widths)
+    told = f"{lengths[0]} updates, {len(lengths)} passes; least squares gain {foretold:.2f} dB"
+    with stage("head", told):
         gain = max(GAIN_OF_MLP * foretold * GAIN_BY_WIDTHS[widths], LEAST_GAIN)
-        done = _trained(task, attempt, learned, widths, gain)
+        done = _trained(task, attempt, learned, widths, lengths, gain)
         best = min(done, key=lambda each: each.share, default=None)
         if best is None:
             return None
@@ -194,7 +195,7 @@ def choose_head(
         plain = ChosenHead(settings, attempt.coding, attempt.outcome, history)
         if task.goal.psnr is None:
             return _at_bound(task, attempt, learned, best, plain)
-        left = size * best.share + own_bytes(best.trained)
+        left = size * best.share + head_bytes(best.trained.head)
         if left >= size * most_left(task):
             return plain
         return ChosenHead(
@@ -205,8 +206,8 @@ def choose_head(
         )
 
 
-def training_length(task: PlanTask, widths: Widths) -> tuple[int, int]:
-    """Return the updates of the first training, and the number of trainings.
+def training_lengths(task: PlanTask, widths: Widths) -> list[int]:
+    """Return the updates of each training.
 
     Counted work turns seconds into updates, so that no clock changes a byte.
     """
@@ -217,14 +218,21 @@ def training_length(task: PlanTask, widths: Widths) -> tuple[int, int]:
     else:
         of_update = 1e-9 * TRAINING_NS * weights_of(widths) * BATCH_VOXELS
         updates = max(1, round(seconds / of_update / (1 + AGAIN * (PASSES - 1))))
-    return updates, PASSES if updates <= LONG * UPDATES else PASSES + 1
+    passes = PASSES if updates <= LONG * UPDATES else PASSES + 1
+    return [updates, *[max(1, round(AGAIN * updates))] * (passes - 1)]
 
 
 def _trained(
-    task: PlanTask, attempt: Attempt, parts: Sample, widths: Widths, gain: float
+    task: PlanTask,
+    attempt: Attempt,
+    parts: Sample,
+    widths: Widths,
+    lengths: Sequence[int],
+    gain: float,
 ) -> list[_Pass]:
     """Train and code in turns; what each pass saves. Empty where there is nothing to learn.
 
+    lengths: updates of each training.
     gain: expected of the MLP, in dB.
     """
     data_range, at = task.goal.data_range, replace(attempt.settings, mask=None)
@@ -236,9 +244,7 @@ def _trained(
     promise = (task.goal.psnr or alone.psnr(data_range) + gain) + AIM_OF_MLP
     if task.goal.psnr is not None and not parts.complete:  # their PSNR is not that of all tiles
         promise = parts.run(at, attempt.coding).psnr(data_range) + AIM_OF_MLP
-    updates, count = training_length(task, widths)
-    slower = math.sqrt(min(UPDATES / updates, 1.0))
-    lengths = [updates, *[max(1, round(AGAIN * updates))] * (count - 1)]
+    slower = math.sqrt(min(UPDATES / lengths[0], 1.0))
     for number, length in enumerate(lengths):
         coded = alone if trained is None else _left_to(trained.head, parts, alone)
         trained = train_head(
@@ -248,7 +254,7 @@ def _trained(
             widths,
             Budget(
                 updates=length,
-                samples=min(max(SAMPLES, SAMPLES_OF_UPDATE * updates), MOST_SAMPLES),
+                samples=min(max(SAMPLES, SAMPLES_OF_UPDATE * lengths[0]), MOST_SAMPLES),
                 seed=task.config.seed + number,
                 rate=(RATE if number == 0 else RATE_AGAIN) * slower,
             ),
@@ -266,7 +272,7 @@ def _trained(
         better = step * math.sqrt(min(max(step / before, 1.0), MOST_AHEAD)) if before else step
         before = step
         done.append(_Pass(trained, psnr, better, share, JOINT if number else 0.0))
-        if abs(excess) > FAR and number + 1 < count:
+        if abs(excess) > FAR and number + 1 < len(lengths):
             coarser = replace(coarser, step=step)
             alone = _Coded.of(parts, coarser, coding)
     return done
@@ -354,7 +360,7 @@ def _at_bound(
     before = few.run(attempt.settings, task.goal.bounded(attempt.coding))
     trained = replace(attempt.settings, head=best.trained.head, step=best.step)
     settings, outcome = find_step(few, trained, joint, task.goal, tries=3)
-    size = attempt.outcome.size * outcome.size / before.size + own_bytes(best.trained)
+    size = attempt.outcome.size * outcome.size / before.size + head_bytes(best.trained.head)
     if size >= attempt.outcome.size * most_left(task):
         return plain
     return ChosenHead(settings, joint, replace(attempt.outcome, size=round(size)), plain.history)

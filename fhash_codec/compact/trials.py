@@ -456,6 +456,11 @@ def tiles_of(task: PlanTask, attempt: Attempt) -> Sample:
     """Return all tiles of a plan, or many where a series is large, filled as they are coded."""
     blocks = task.blocks.retile(attempt.sample.blocks.tile)
     most = SEARCHED if prod(blocks.shape) <= SEARCHED else SAMPLED
+    return _filled_sample(task, blocks, attempt, most)
+
+
+def _filled_sample(task: PlanTask, blocks: Blocks, attempt: Attempt, most: int) -> Sample:
+    """Return tiles of at most so many vertices together, filled as they are coded."""
     costs = part_costs(task, blocks, attempt.settings)
     sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
     return sample.filled(attempt.settings, attempt.coding.density)
@@ -465,10 +470,10 @@ MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
 
 
-def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Attempt:
+def with_head(task: PlanTask, attempt: Attempt, most: float = math.inf) -> Attempt:
     """Return the plan with an MLP where coded parts say that one pays.
 
-    beside: bytes that the tiles take in another way, which it has to save as well.
+    most: bytes that the tiles take in another way, which it has to save as well.
     """
     if reason := _without_head(task, attempt):
         skip("head", reason)
@@ -483,14 +488,11 @@ def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Att
     if gain < least_gain(task):
         skip("head", f"least squares gain {gain:.2f} dB on some parts: none would save enough")
         return attempt
-    if expected_share(gain) * attempt.outcome.size > beside:
+    if expected_share(gain) * attempt.outcome.size > most:
         skip("head", "predicted values take fewer bytes than it would leave")
         return attempt
     task.parts.begin("head")
-    blocks = attempt.sample.blocks
-    costs = part_costs(task, blocks, attempt.settings)
-    learned = Sample(blocks, LEARNED, task.workers, costs, task.parts.tick)
-    learned = learned.filled(attempt.settings, attempt.coding.density)
+    learned = _filled_sample(task, attempt.sample.blocks, attempt, LEARNED)
     filled = replace(attempt, coding=with_fill(attempt.coding))
     found = choose_head(task, filled, learned, gain)
     return_memory()
@@ -498,6 +500,8 @@ def with_head(task: PlanTask, attempt: Attempt, beside: float = math.inf) -> Att
         task.gains.note("head (left out)", attempt.outcome)
         return attempt if found is None else replace(attempt, history=found.history)
     task.gains.note("head", found.outcome)
+    if learned.complete:  # it is filled: no plan fills it again
+        attempt = replace(attempt, sample=learned)
     return replace(
         attempt,
         settings=found.settings,
