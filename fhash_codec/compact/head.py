@@ -28,6 +28,7 @@ from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Coding, Outcome, Tile, measured, total
 from fhash_codec.compact.transform import scale_of
 from fhash_codec.progress import stage
+from fhash_formats.support.values import Single
 from fhash_formats.transform.head import NeighbourHead
 from fhash_formats.transform.tile import CodedTile, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
@@ -238,7 +239,7 @@ def _trained(
     data_range, at = task.goal.data_range, replace(attempt.settings, mask=None)
     coding = replace(attempt.coding, aim=0.0, passes=1, rounds=0)
     coarser = replace(at, step=_step_below(attempt, at.step, gain))
-    trained, done, before = None, list[_Pass](), 0.0
+    trained, corrected, done, before = None, list[Single](), list[_Pass](), 0.0
     slope = min(max(gain / math.log(coarser.step / at.step), MIN_SLOPE), MAX_SLOPE)
     alone = _Coded.of(parts, coarser, coding)
     promise = (task.goal.psnr or alone.psnr(data_range) + gain) + AIM_OF_MLP
@@ -246,7 +247,12 @@ def _trained(
         promise = parts.run(at, attempt.coding).psnr(data_range) + AIM_OF_MLP
     slower = math.sqrt(min(UPDATES / lengths[0], 1.0))
     for number, length in enumerate(lengths):
-        coded = alone if trained is None else _left_to(trained.head, parts, alone)
+        if trained is None:
+            coded = alone
+        else:
+            if coded is not alone:
+                corrected = _corrected(parts, alone, trained.head)
+            coded = _left_to(corrected, parts, alone)
         trained = train_head(
             coded.pairs,
             coarser.low,
@@ -263,7 +269,8 @@ def _trained(
         )
         if trained is None:
             break
-        psnr = _corrected(parts, coded, trained).psnr(data_range)
+        corrected = _corrected(parts, coded, trained.head)
+        psnr = _error_of(corrected, parts, coded).psnr(data_range)
         gained = psnr - alone.psnr(data_range)
         share = coded.size / max(alone.size, 1) * 2 ** (-gained / OCTAVE)
         excess = min(psnr - promise, MOST_EXCESS)
@@ -300,21 +307,23 @@ class _Coded(NamedTuple):
         return self.outcome.psnr(data_range)
 
 
-def _left_to(head: NeighbourHead, parts: Sample, alone: _Coded) -> _Coded:
+def _left_to(corrected: Sequence[Single], parts: Sample, alone: _Coded) -> _Coded:
     """Return parts that are coded less by what an MLP adds to them.
 
     It is what the coder does with an MLP (native/encode.cpp, leave_to_head).
 
+    corrected: what the MLP makes of them.
     alone: the parts coded without one.
     """
 
-    def coded(pair: Pair) -> CodedTile:
+    def coded(job: tuple[Pair, Single]) -> CodedTile:
+        pair, with_mlp = job
         with np.errstate(over="ignore", invalid="ignore"):
-            less = np.float32(JOINT) * (head.apply(pair.decoded) - pair.decoded)
+            less = np.float32(JOINT) * (with_mlp - pair.decoded)
             values = pair.original.astype(np.float32) - less
         return encode_tile(values, alone.settings, alone.coding, in_coreset=pair.counted)
 
-    tiles = parts.each(coded, alone.pairs)
+    tiles = parts.each(coded, list(zip(alone.pairs, corrected, strict=True)))
     pairs = [
         pair._replace(decoded=tile.decoded) for pair, tile in zip(alone.pairs, tiles, strict=True)
     ]
@@ -322,17 +331,21 @@ def _left_to(head: NeighbourHead, parts: Sample, alone: _Coded) -> _Coded:
     return alone._replace(pairs=pairs, size=sum(sizes))
 
 
-def _corrected(parts: Sample, coded: _Coded, trained: TrainedHead) -> Outcome:
+def _corrected(parts: Sample, coded: _Coded, head: NeighbourHead) -> list[Single]:
+    """Return what an MLP makes of coded parts."""
+    return parts.each(lambda pair: head.apply(pair.decoded), coded.pairs)
+
+
+def _error_of(corrected: Sequence[Single], parts: Sample, coded: _Coded) -> Outcome:
     """Return the error of coded parts with an MLP."""
 
-    def corrected(job: tuple[Pair, Tile]) -> Outcome:
-        pair, tile = job
-        values = cast(trained.head.apply(pair.decoded), tile.values.dtype)
-        decoded = CodedTile(data=b"", decoded=values, nonzero=0)
+    def outcome(job: tuple[Single, Tile]) -> Outcome:
+        values, tile = job
+        decoded = CodedTile(data=b"", decoded=cast(values, tile.values.dtype), nonzero=0)
         return measured(tile, decoded, coded.settings, coded.coding)
 
-    jobs = list(zip(coded.pairs, parts.tiles, strict=True))
-    return total(parts.each(corrected, jobs), parts.weights)
+    jobs = list(zip(corrected, parts.tiles, strict=True))
+    return total(parts.each(outcome, jobs), parts.weights)
 
 
 def _report(task: PlanTask, before: int, length: int, total: int) -> Callable[[float], None]:
