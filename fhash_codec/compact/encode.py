@@ -31,7 +31,7 @@ from fhash_codec.compact.goal import (
     search,
     with_step,
 )
-from fhash_codec.compact.head import head_bytes
+from fhash_codec.compact.head import head_bytes, training_device
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
 from fhash_codec.compact.tiles import (
@@ -660,28 +660,28 @@ def table_header(
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": None if table.bulk is None else {"range": list(table.bulk.ends)}},
-        "training": training_header(table.plan, timings=config.timings),
+        "training": training_header(table.plan, config),
         "history": brief_history(kept, timings=config.timings, most=HEAD_POINTS),
     }
 
 
-def training_header(coding_plan: CodingPlan, *, timings: bool) -> dict[str, Any]:
+def training_header(coding_plan: CodingPlan, config: EncodeConfig) -> dict[str, Any]:
     """Return what a header says of the training of the MLP.
 
     The device is "none" where nothing was trained.
     """
     history = coding_plan.history
     if not history:
-        return {"seconds": 0 if timings else None, "steps": 0, "epochs": 0, "device": "none"}
+        return {"seconds": 0 if config.timings else None, "steps": 0, "epochs": 0, "device": "none"}
     last = history[-1]
     seconds, steps, samples = last["seconds"], last["epoch"], last["samples"]
     assert seconds is not None
     assert steps is not None
     assert samples is not None
     return {
-        "seconds": round(seconds, 3) if timings else None,
+        "seconds": round(seconds, 3) if config.timings else None,
         "steps": int(steps),
         "epochs": max(1, round(steps * BATCH_VOXELS / samples)),
-        "device": "cpu",
+        "device": training_device(config),
         **({} if coding_plan.saved is None else {"saved": round(coding_plan.saved, 3)}),
     }

@@ -27,6 +27,7 @@ from fhash_codec.compact.head_training import (
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Coding, Outcome, Tile, measured, total
 from fhash_codec.compact.transform import scale_of
+from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import stage
 from fhash_formats.support.values import Single
 from fhash_formats.transform.head import NeighbourHead
@@ -207,6 +208,14 @@ def choose_head(
         )
 
 
+def training_device(config: EncodeConfig) -> str:
+    """Return where an MLP is trained: on CUDA where that is asked for.
+
+    'auto' is the CPU, which is done before CUDA has started.
+    """
+    return "cuda" if config.device == "cuda" else "cpu"
+
+
 def training_lengths(task: PlanTask, widths: Widths) -> list[int]:
     """Return the updates of each training.
 
@@ -263,6 +272,7 @@ def _trained(
                 samples=min(max(SAMPLES, SAMPLES_OF_UPDATE * lengths[0]), MOST_SAMPLES),
                 seed=task.config.seed + number,
                 rate=(RATE if number == 0 else RATE_AGAIN) * slower,
+                device=training_device(task.config),
             ),
             progress=_report(task, sum(lengths[:number]), length, sum(lengths)),
             start=trained,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -282,15 +282,15 @@ class Network:
         rates: Double,
         roots: Double,
         *,
-        as_in_file: bool,
+        rounded: bool,
         threads: int = 1,
     ) -> None:
         """Do some updates. Update u learns from batch u % batches.
 
         first: number of the first of these updates.
         rates, roots: `adam_factors` of these updates.
-        as_in_file: whether weights and biases are rounded as in the file. Gradients pass through
-            the rounding unchanged.
+        rounded: whether weights and biases are rounded as in the file. Gradients pass through the
+            rounding unchanged.
         threads: number that work on a batch together; they change no bit.
         """
         factors = np.ascontiguousarray(rates), np.ascontiguousarray(roots)
@@ -300,31 +300,35 @@ class Network:
                 *map(pointer, (self.parameters, self.means, self.squares, *factors)),
                 first,
                 len(rates),
-                as_in_file,
+                rounded,
                 threads,
             )
         )
 
-    def squared_errors(self, voxels: Batches, *, as_in_file: bool) -> list[int]:
+    def squared_errors(self, voxels: Batches, *, rounded: bool) -> list[int]:
         """Return the sum of the squared errors of each batch, in squares of ERROR_UNIT."""
         sums = np.empty(len(voxels), dtype=np.int64)
         _check(
             native.library().fhash_head_errors(
-                *self._arguments(voxels), pointer(self.parameters), as_in_file, pointer(sums)
+                *self._arguments(voxels), pointer(self.parameters), rounded, pointer(sums)
             )
         )
         return sums.tolist()
 
     def layers(self) -> tuple[Layer, ...]:
         """Return the layers as the file holds them."""
-        layers, at = [], 0
+        return tuple(
+            Layer.of(as_in_file(weights, MAX_WEIGHT), as_in_file(biases, MAX_BIAS))
+            for weights, biases in self.parts()
+        )
+
+    def parts(self) -> Iterator[tuple[Double, Double]]:
+        """Yield the weights (out, in) and the biases (out,) of each layer."""
+        at = 0
         for inputs, outputs in zip((INPUTS, *self.widths), (*self.widths, 1), strict=True):
             end = at + outputs * inputs
-            weights = self.parameters[at:end].reshape(outputs, inputs)
-            biases = self.parameters[end : end + outputs]
-            layers.append(Layer.of(_as_in_file(weights, MAX_WEIGHT), _as_in_file(biases, MAX_BIAS)))
+            yield self.parameters[at:end].reshape(outputs, inputs), self.parameters[end:][:outputs]
             at = end + outputs
-        return tuple(layers)
 
     def _arguments(self, voxels: Batches) -> Sequence[ctypes.c_void_p]:
         """Return the arguments of the native functions that describe the voxels."""
@@ -336,7 +340,7 @@ class Network:
         return [*addresses, ctypes.cast(sizes, ctypes.c_void_p)]
 
 
-def _as_in_file(values: Double, most: int) -> Scaled:
+def as_in_file(values: Double, most: int) -> Scaled:
     """Return weights or biases as the integers of the file, at most `most` either way.
 
     Their unit is a float16 that maps the largest magnitude to at most `most`.
@@ -402,6 +406,8 @@ class Budget:
     rate: float = 1e-2
     """Highest learning rate. A short training gains as much as one of twice its length where it
     learns three times as fast; a long one does not."""
+    device: str = "cpu"
+    """Where it is trained, 'cpu' or 'cuda'. It changes no bit."""
 
 
 def train_head(
@@ -442,9 +448,14 @@ def train_head(
     networks = [Network(widths, random) for _ in range(STARTS if start is None else 1)]
     if start is not None:
         networks[0].parameters[:] = start.parameters
-    history, network = _optimise(
-        networks, training, held_out, _rates(budget.updates, budget.rate), progress
-    )
+    learn: Callable[..., None] = Network.learn
+    if budget.device != "cpu":
+        # Needs torch.
+        from fhash_codec.compact.head_device import DeviceLearner
+
+        learn = DeviceLearner(training, budget.device).learn
+    rates = _rates(budget.updates, budget.rate)
+    history, network = _optimise(networks, learn, training, held_out, rates, progress)
     head = NeighbourHead(
         layers=network.layers(),
         sigma=float(sigma),
@@ -524,6 +535,7 @@ def _sigma(drawn: Sequence[Voxels]) -> np.float32:
 
 def _optimise(
     networks: list[Network],
+    learn: Callable[..., None],
     training: Batches,
     held_out: Batches,
     rates: Double,
@@ -533,6 +545,7 @@ def _optimise(
 
     The gains are tuples (seconds, update, dB).
 
+    learn: does some updates, as `Network.learn` does.
     rates: learning rate of each update.
     """
     history: list[tuple[float, int, float]] = []
@@ -547,20 +560,21 @@ def _optimise(
     began, done = perf_counter(), 0
     for pause in sorted(pauses - {0}):
         for network in networks:
-            network.learn(
+            learn(
+                network,
                 training,
                 done + 1,
                 factors[done:pause],
                 roots[done:pause],
-                as_in_file=done >= unrounded,
+                rounded=done >= unrounded,
                 threads=usable_threads(),
             )
         done = pause
         if done == chosen:
-            gains = [_gain(network, held_out, as_in_file=False) for network in networks]
+            gains = [_gain(network, held_out, rounded=False) for network in networks]
             networks = [networks[gains.index(max(gains))]]
         if done in measured:
-            gains = [_gain(network, held_out, as_in_file=True) for network in networks]
+            gains = [_gain(network, held_out, rounded=True) for network in networks]
             history.append((perf_counter() - began, done, max(gains)))
         if progress is not None:
             progress(done / updates)
@@ -578,12 +592,12 @@ def _rates(updates: int, highest: float) -> Double:
     return highest * np.where(share < WARM_UP, share / WARM_UP, 1 - fall * fall * (3 - 2 * fall))
 
 
-def _gain(network: Network, held_out: Batches, *, as_in_file: bool) -> float:
+def _gain(network: Network, held_out: Batches, *, rounded: bool) -> float:
     """Return the dB that a network gains on the held-out voxels.
 
     Squares below that of the unit of errors count as that of the unit, so the gain is finite.
     """
-    after = sum(network.squared_errors(held_out, as_in_file=as_in_file))
+    after = sum(network.squared_errors(held_out, rounded=rounded))
     return 10 * math.log10(max(_squares_before(held_out), 1) / max(after, 1))
 
 

@@ -6,6 +6,7 @@ import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,7 @@ def test_the_gradient_is_that_of_the_mean_squared_error() -> None:
         return _loss(data, parameters, (4, 3))
 
     start = trained.parameters.copy()
-    trained.learn(data, 1, *factors(1, rate=0.0), as_in_file=False)
+    trained.learn(data, 1, *factors(1, rate=0.0), rounded=False)
     assert (trained.parameters == start).all()
     gradient = 10 * trained.means
     numeric = np.empty_like(gradient)
@@ -129,15 +130,28 @@ def _loss(data: Batches, parameters: npt.NDArray[np.float64], widths: tuple[int,
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-@pytest.mark.parametrize("as_in_file", [False, True])
-def test_the_bits_of_training_are_fixed(as_in_file: bool, threads: int) -> None:
+@pytest.mark.parametrize("rounded", [False, True])
+def test_the_bits_of_training_are_fixed(rounded: bool, threads: int) -> None:
     """So that the same series gives the same bytes on every machine."""
     data = voxels(2, 3)
     trained = network()
-    trained.learn(data, 1, *factors(6), as_in_file=as_in_file, threads=threads)
-    sums = trained.squared_errors(data, as_in_file=as_in_file)
+    trained.learn(data, 1, *factors(6), rounded=rounded, threads=threads)
+    sums = trained.squared_errors(data, rounded=rounded)
     digest = hashlib.sha256(trained.parameters.tobytes() + repr(sums).encode()).hexdigest()
-    assert digest[:16] == DIGESTS[as_in_file]
+    assert digest[:16] == DIGESTS[rounded]
+
+
+@pytest.mark.torch
+@pytest.mark.parametrize("rounded", [False, True])
+def test_a_device_trains_the_same_bits(rounded: bool) -> None:
+    from fhash_codec.compact.head_device import DeviceLearner
+
+    data = voxels(2, 3)
+    here, there = network(), network()
+    here.learn(data, 1, *factors(30), rounded=rounded)
+    DeviceLearner(data, "cpu").learn(there, data, 1, *factors(30), rounded=rounded)
+    for name in ("parameters", "means", "squares"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
 
 
 DIGESTS = {False: "ddaaf270cd9038d7", True: "804d969ac5100df2"}
@@ -221,6 +235,19 @@ def test_the_same_seed_gives_the_same_head(front: tuple[Floats, Floats]) -> None
         for budget in budgets
     ]
     assert runs[0] == runs[1] != runs[2]
+
+
+@pytest.mark.torch
+def test_training_on_cuda_gives_the_head_of_the_cpu(front: tuple[Floats, Floats]) -> None:
+    from pretended_cuda import pretended_cuda
+
+    pair, budget = Pair(*front, None), Budget(updates=40, samples=40_000)
+    here = train_head([pair], -1.0, 2.0, (24, 16), budget)
+    with pretended_cuda() as pretended:
+        on_cuda = replace(budget, device="cuda")
+        there = train_head([pair], -1.0, 2.0, (24, 16), on_cuda)
+    assert pretended.counts["launches"] > 40
+    assert here.head.to_bytes() == there.head.to_bytes()
 
 
 def test_voxels_that_do_not_count_do_not_matter(front: tuple[Floats, Floats]) -> None:
