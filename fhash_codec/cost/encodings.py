@@ -21,7 +21,7 @@ from fhash_codec.cost.plan import (
     options_of,
 )
 from fhash_codec.cost.prediction import Prediction
-from fhash_codec.cost.results import Curve, Encoded
+from fhash_codec.cost.results import DEFAULT, TRAINING, Curve, Encoded
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress
 from fhash_codec.volume import open as open_volume
@@ -100,6 +100,9 @@ class OwnEncodings:
         before = next((point for point in self.points if point.name == wish.name), None)
         if before is not None and before.measured:
             return
+        if wish.group == TRAINING and all(curve.name != DEFAULT for curve in self.curves):
+            self._allowance.leave_out(wish.name, "the default settings expect no gain from an MLP")
+            return
         with self._allowance.work(f"prediction of {wish.name}"):
             self._predict(wish.config)
         point = _predicted(wish, self._predictions.get(wish.config))
@@ -127,7 +130,7 @@ class OwnEncodings:
         """Seconds that an encoding will take: as one of its kind did, or by its prediction."""
         prediction = self._predictions.get(config)
         if config.effort in self._usual:
-            return self._usual[config.effort]
+            return self._usual[config.effort] + (config.training_seconds or 0.0)
         if prediction is not None:
             # This machine, under its present load, differs from the predictions by a factor.
             return prediction.seconds * median(self._ratios or [1.0])
@@ -166,7 +169,7 @@ class OwnEncodings:
         self.files.append(KeptFile(name=measured.name, path=kept, psnr=measured.psnr))
         if report["curve"]:
             self.curves.append(Curve(name=measured.name, points=tuple(report["curve"])))
-        if not wish.config.published:
+        if not wish.config.published and wish.group != TRAINING:
             self._usual[wish.config.effort] = report["seconds"]
             if point.predicted_seconds:
                 self._ratios.append(report["seconds"] / point.predicted_seconds)

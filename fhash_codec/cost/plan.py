@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig, options_beyond
-from fhash_codec.cost.results import DEFAULT, NETWORK, LeftOut
+from fhash_codec.cost.results import DEFAULT, NETWORK, TRAINING, LeftOut
 from fhash_codec.features.features import Extent
 from fhash_codec.features.selection import select_features
 from fhash_codec.measure.errors import Errors, find_bulk
@@ -281,6 +281,8 @@ class Wish:
             return f"{self.group}, error within {100 * self.config.max_error_rel:g} %"
         if self.config.psnr is not None:
             return f"{self.group}, {self.config.psnr:g} dB"
+        if self.group == TRAINING:
+            return f"{TRAINING} {self.config.train}"
         return NETWORK if self.config.published else DEFAULT
 
     @property
@@ -296,6 +298,10 @@ def options_of(config: EncodeConfig) -> str:
         text = f"{value:.12g}" if isinstance(value, float) else f"{value}"
         words += [option] if value is None else [option, shlex.quote(text)]
     return " ".join(words)
+
+
+TRAININGS = ("none", "2s", "10s")
+"""Values of `--train` that are tried beside the default, where that trains an MLP."""
 
 
 def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
@@ -315,6 +321,9 @@ def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
     yield own(1, psnr=50.0)
     # A peer takes several times the time that is shown for it, since it is led to its target.
     yield from peers(50.0)
+    for train in TRAININGS:
+        config = EncodeConfig(features=features, train=train)
+        yield Wish(codec=config.preset, group=TRAINING, config=config)
     # The rows of the advice: the fastest and the default of each, and then what may be smaller.
     for efforts, targets in (((1, 5), (40.0, 60.0, 45.0)), ((3,), (50.0, 40.0, 60.0, 45.0))):
         for target in targets:

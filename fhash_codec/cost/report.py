@@ -24,11 +24,13 @@ from fhash_codec.cost.results import (
     ADVICE,
     DEFAULT,
     NETWORK,
+    TRAINING,
     CostReport,
     Encoded,
     Picture,
     Read,
     advice_rows,
+    by_training,
     bytes_text,
     conclusion,
     feature_options,
@@ -50,6 +52,7 @@ STYLES: dict[str, tuple[str, str]] = {
     "effort 7": ("#D55E00", "D"),
     "effort 9": ("#D55E00", "*"),
     NETWORK: ("#CC79A7", "*"),
+    TRAINING: ("#009E73", "o"),
     "SZ3": (GREY, "s"),
     "SPERR": (GREY, "^"),
     "ZFP": (GREY, "X"),
@@ -139,6 +142,11 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
         title = "Quality against time; large points are large files"
         made = _frontier(points, "seconds", "psnr")
         yield Panel("answer", "", title, "seconds of encoding", decibel, made, log="x")
+        made = curves(
+            Point(TRAINING, each.seconds, each.bytes, _hover(each)) for each in by_training(report)
+        )
+        title, x = "What training saves, at the accuracy of the default", "seconds of encoding"
+        yield Panel("saved", "", title, x, SIZE, made)
         for key, title, y, field, log in (
             ("bytes", "Accuracy", decibel, "psnr", "x"),
             ("bulk", "Accuracy of the bulk", "PSNR of the middle 98 %, dB", "psnr_bulk", "x"),
@@ -175,6 +183,7 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
 
 def _frontier(points: Sequence[Encoded], x: str, y: str) -> dict[str, list[Point]]:
     """A curve of measured points for each group, and one of the predictions that are trusted."""
+    points = [point for point in points if point.group != TRAINING]
     drawn, largest = trusted(points), max((point.bytes or 0 for point in points), default=0) or 1
     made = []
     for point in points:
@@ -321,23 +330,30 @@ FEW_DECADES = 300
 
 
 def plot(report: CostReport, path: Path) -> None:
-    """Draw the first screen as a PNG: the first plot, and the advice or else the second plot.
+    """Draw the first screen as a PNG: its plots, and the advice beside them.
+
+    Without advice it has the first two plots of all.
 
     Raises MissingDependencyError without matplotlib.
     """
     module = require_matplotlib()
-    shown = panels(report)[: 1 if report.advice else 2]
+    made = panels(report)
+    shown = [panel for panel in made if not panel.section] if report.advice else made[:2]
     with importlib.import_module("matplotlib").rc_context(RC):
         figure = module.Figure(figsize=(12.8, 6.4), layout="constrained", dpi=100)
         title = [TITLE + report.series, *textwrap.wrap(conclusion(report), 150)]
         figure.suptitle("\n".join(title))
-        both = figure.subplots(1, 2, width_ratios=(5, 6))
-        for axes, panel in zip(both, shown, strict=False):
-            _draw(axes, panel)
-        for axes in both[len(shown) :]:
-            axes.set_axis_off()
+        left, right = figure.add_gridspec(1, 2, width_ratios=(5, 6))
         if report.advice:
-            _draw_advice(both[1], report)
+            places = left.subgridspec(len(shown) or 1, 1, height_ratios=(3, 2)[: len(shown) or 1])
+            axes = [figure.add_subplot(place) for place in places]
+            _draw_advice(figure.add_subplot(right, frame_on=False, xticks=[], yticks=[]), report)
+        else:
+            axes = [figure.add_subplot(place) for place in (left, right)]
+        for each, panel in zip(axes, shown, strict=False):
+            _draw(each, panel)
+        for each in axes[len(shown) :]:
+            each.set_axis_off()
         figure.savefig(path, format="png")
 
 
@@ -402,8 +418,13 @@ def _draw(axes: Any, panel: Panel) -> list[str]:
         axes.plot(*[[min(ends), max(ends)]] * 2, color=INK, linestyle=":", linewidth=1)
     for name, label in (("x", panel.x), ("y", panel.y)):
         getattr(axes, f"set_{name}label")(label)
+        text = bytes_text if "bytes" in label else "{:g}".format
         if name in panel.log:
-            _set_logarithmic(axes, name, bytes_text if "bytes" in label else "{:g}".format)
+            _set_logarithmic(axes, name, text)
+        elif not panel.bars:
+            getattr(axes, f"{name}axis").set_major_formatter(
+                lambda value, _, text=text: text(value)
+            )
     if panel.y.startswith(ERROR):
         axes.invert_yaxis()
     axes.set_title(panel.title, fontsize=9.5)
@@ -458,6 +479,7 @@ def page(report: CostReport) -> str:
     """The page; raises MissingDependencyError without matplotlib."""
     made = panels(report)
     answer = "".join(_figure(panel) for panel in made if not panel.section)
+    answer = f"<div>{answer}</div>" if answer else ""
     filled = {
         "title": escape(TITLE + report.series),
         "conclusion": re.sub(r"--[\w-]+", r"<code>\g<0></code>", escape(conclusion(report))),

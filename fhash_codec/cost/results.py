@@ -16,6 +16,8 @@ OWN = PRESETS
 """Codecs of this package, by their presets; the others are peers."""
 DEFAULT = "default settings"
 """Name of the encoding that `fhash encode` makes without options."""
+TRAINING = "training"
+"""Curve of the encodings that differ from the default settings in `--train` alone."""
 NETWORK = "published network"
 """Name of the encoding with `--preset published` alone, and of its curve."""
 
@@ -336,6 +338,7 @@ def advice_rows(report: CostReport) -> list[tuple[str, ...]]:
     """The table of advice: a row for each accuracy and encoding, with all its aims in one cell.
 
     The accuracy stands in the first of its rows alone; options leave out the features of all rows.
+    The last rows are those of `by_training`.
     """
     common = " ".join(feature_options(report))
     rows: dict[tuple[str, str], list[Advice]] = {}
@@ -356,7 +359,26 @@ def advice_rows(report: CostReport) -> list[tuple[str, ...]]:
             )
         )
         last = goal
+    for place, point in enumerate(by_training(report)):
+        setting = "default" if point.name == DEFAULT else point.name.removeprefix(f"{TRAINING} ")
+        region = "-" if point.region_ms is None else seconds_text(point.region_ms, "ms")
+        size, options = bytes_text(point.bytes or 0), point.options.replace(common, "").strip()
+        goal = "" if place else TRAINING
+        took = seconds_text(point.seconds or 0.0)
+        cells.append((goal, setting, took, size, region, options or "none"))
     return cells
+
+
+def by_training(report: CostReport) -> list[Encoded]:
+    """The default settings and what differs from them in its training alone, the fastest first.
+
+    It is empty where no other training was measured.
+    """
+    points = [point for point in report.encodings if point.measured]
+    if all(point.group != TRAINING for point in points):
+        return []
+    chosen = [point for point in points if point.group == TRAINING or point.name == DEFAULT]
+    return sorted(chosen, key=lambda point: point.seconds or 0.0)
 
 
 def feature_options(report: CostReport) -> list[str]:

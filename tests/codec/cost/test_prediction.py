@@ -46,6 +46,7 @@ from fhash_codec.cost.probe import CompactProbe, PaperProbe, part_of, promise_of
 from fhash_codec.cost.results import (
     DEFAULT,
     NETWORK,
+    TRAINING,
     CostReport,
     Encoded,
     advise,
@@ -762,6 +763,20 @@ def test_the_default_and_the_network_need_no_time_left(series: ArraySeries, tmp_
     assert [curve.name for curve in encodings.curves][-1] == NETWORK
     assert not {DEFAULT, NETWORK} & {entry.what for entry in allowance.left_out}
     assert list(tmp_path.glob("*.checkpoint")) == []
+
+
+def test_no_training_is_tried_where_the_default_trains_nothing(
+    series: ArraySeries, tmp_path: Path
+) -> None:
+    allowance = Allowance(1000.0)
+    encodings = OwnEncodings(series, tmp_path, allowance, foretold, silent)
+    trainings = [wish for wish in wishes() if wish.group == TRAINING]
+    assert [wish.name for wish in trainings] == ["training none", "training 2s", "training 10s"]
+    for wish in (next(wishes()), *trainings):
+        encodings.measure(wish)
+    assert [point.name for point in encodings.points] == [DEFAULT]
+    assert [entry.what for entry in allowance.left_out] == [wish.name for wish in trainings]
+    assert "no gain from an MLP" in allowance.left_out[0].why
 
 
 def test_ctrl_c_in_a_training_ends_the_measurements(

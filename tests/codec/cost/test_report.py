@@ -30,7 +30,7 @@ from fhash_codec.cost.report import (
     tables,
     write_report,
 )
-from fhash_codec.cost.results import CostReport
+from fhash_codec.cost.results import DEFAULT, TRAINING, CostReport, advice_rows
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
 
 
@@ -71,6 +71,28 @@ def test_trainings_stages_and_steps(report: CostReport) -> None:
     assert made["stages"].bars
     assert made["stages"].curves[""][0].y == "head"
     assert made["per-step"].curves[""][0].y == 40.0
+
+
+def test_what_training_saves_is_told_and_drawn_beside_the_default(report: CostReport) -> None:
+    (usual, *others) = report.encodings
+    usual = replace(usual, name=DEFAULT, options="", seconds=3.0, bytes=900, region_ms=2.0)
+    trained = [
+        replace(usual, name=f"training {train}", group=TRAINING, options=f"--train {train}",
+                seconds=seconds, bytes=size)
+        for train, seconds, size in (("2s", 6.0, 800), ("none", 1.0, 1500))
+    ]  # fmt: skip
+    report = replace(report, encodings=(usual, *others, *trained))
+    made = {panel.key: panel for panel in encode_panels(report)}
+    points = made["saved"].curves[TRAINING]
+    assert [point[1:3] for point in points] == [(1.0, 1500), (3.0, 900), (6.0, 800)]
+    assert TRAINING not in made["answer"].curves
+    assert advice_rows(report)[-3:] == [
+        ("training", "none", "1 s", "1.5 kB", "2 ms", "--train none"),
+        ("", "default", "3 s", "900 B", "2 ms", "none"),
+        ("", "2s", "6 s", "800 B", "2 ms", "--train 2s"),
+    ]
+    untold = replace(report, encodings=(usual, *others))
+    assert "saved" not in {panel.key for panel in panels(untold)}
 
 
 def test_curves_of_their_own_keep_their_style_and_differ() -> None:
