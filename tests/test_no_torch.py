@@ -104,10 +104,10 @@ def test_what_needs_torch_says_so_in_one_line(
     assert "Traceback" not in errors
 
 
-def test_a_device_for_compact_is_refused(results: dict[str, Any]) -> None:
+def test_cuda_needs_torch_with_every_preset(results: dict[str, Any]) -> None:
     code, _, errors = results["compact on cuda"]
     assert code == 2
-    assert "device belongs to --preset published" in errors
+    assert "device 'cuda' needs torch" in errors
 
 
 def test_a_benchmark_trains_the_network_and_names_no_torch(results: dict[str, Any]) -> None:

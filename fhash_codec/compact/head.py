@@ -16,6 +16,7 @@ import numpy as np
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
 from fhash_codec.compact.goal import MAX_SLOPE, MIN_SLOPE, find_step, step_after_gain
+from fhash_codec.compact.head_device import learner_on
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     Budget,
@@ -272,7 +273,7 @@ def _trained(
                 samples=min(max(SAMPLES, SAMPLES_OF_UPDATE * lengths[0]), MOST_SAMPLES),
                 seed=task.config.seed + number,
                 rate=(RATE if number == 0 else RATE_AGAIN) * slower,
-                device=training_device(task.config),
+                learner=learner_on(training_device(task.config)),
             ),
             progress=_report(task, sum(lengths[:number]), length, sum(lengths)),
             start=trained,

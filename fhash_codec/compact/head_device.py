@@ -5,6 +5,7 @@ All sums over voxels are of integers below 2**53, which float64 holds whatever t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,9 +27,31 @@ from fhash_formats.transform.head import INPUTS, MAX_BIAS, MAX_WEIGHT
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Those of native/train_head.hpp and train_head.cpp.
-INPUT_UNIT, ACTIVATION_UNIT, WEIGHT_UNIT = 512.0, 128.0, 65536.0
-MAX_ACTIVATION, MAX_PARAMETER, MAX_NORM, EPSILON = 4095.0, 64.0, 1.0, 1e-8
+# native/train_head.hpp and train_head.cpp have the same numbers.
+INPUT_UNIT = 512.0
+"""Integer steps of an input."""
+ACTIVATION_UNIT = 128.0
+"""Integer steps of an activation."""
+WEIGHT_UNIT = 65536.0
+"""Integer steps of a weight that is not rounded as in the file."""
+MAX_ACTIVATION = 4095.0
+"""Largest magnitude of an activation, in steps."""
+MAX_PARAMETER = 64.0
+"""Largest magnitude of a weight or bias in training."""
+MAX_NORM = 1.0
+"""Length from which on a gradient is shortened."""
+EPSILON = 1e-8
+"""Least divisor of a move, as Adam has it."""
+
+
+def learner_on(device: str) -> Callable[[Batches], Callable[..., None]]:
+    """Return the learner of `train_head` on a device, 'cpu' or 'cuda', with the same bits.
+
+    Raises MissingDependencyError without torch, InputError where there is no such device.
+    """
+    if device == "cpu":
+        return lambda voxels: Network.learn
+    return lambda voxels: DeviceLearner(voxels, device).learn
 
 
 class DeviceLearner:

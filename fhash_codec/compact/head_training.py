@@ -395,7 +395,7 @@ def weights_of(widths: tuple[int, int]) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Length of the training of a head."""
+    """Length of the training of a head, and what trains it."""
 
     updates: int
     """Number of training updates."""
@@ -406,8 +406,8 @@ class Budget:
     rate: float = 1e-2
     """Highest learning rate. A short training gains as much as one of twice its length where it
     learns three times as fast; a long one does not."""
-    device: str = "cpu"
-    """Where it is trained, 'cpu' or 'cuda'. It changes no bit."""
+    learner: Callable[[Batches], Callable[..., None]] = lambda voxels: Network.learn
+    """Function of some batches, whose result does updates by them as `Network.learn` does."""
 
 
 def train_head(
@@ -448,12 +448,7 @@ def train_head(
     networks = [Network(widths, random) for _ in range(STARTS if start is None else 1)]
     if start is not None:
         networks[0].parameters[:] = start.parameters
-    learn: Callable[..., None] = Network.learn
-    if budget.device != "cpu":
-        # Needs torch.
-        from fhash_codec.compact.head_device import DeviceLearner
-
-        learn = DeviceLearner(training, budget.device).learn
+    learn = budget.learner(training)
     rates = _rates(budget.updates, budget.rate)
     history, network = _optimise(networks, learn, training, held_out, rates, progress)
     head = NeighbourHead(

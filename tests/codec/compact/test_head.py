@@ -20,6 +20,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact import head as training
 from fhash_codec.compact.head import LEAST_GAIN, likely_widths
+from fhash_codec.compact.head_device import DeviceLearner, learner_on
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     BLOCK_VOXELS,
@@ -144,8 +145,6 @@ def test_the_bits_of_training_are_fixed(rounded: bool, threads: int) -> None:
 @pytest.mark.torch
 @pytest.mark.parametrize("rounded", [False, True])
 def test_a_device_trains_the_same_bits(rounded: bool) -> None:
-    from fhash_codec.compact.head_device import DeviceLearner
-
     data = voxels(2, 3)
     here, there = network(), network()
     here.learn(data, 1, *factors(30), rounded=rounded)
@@ -244,7 +243,7 @@ def test_training_on_cuda_gives_the_head_of_the_cpu(front: tuple[Floats, Floats]
     pair, budget = Pair(*front, None), Budget(updates=40, samples=40_000)
     here = train_head([pair], -1.0, 2.0, (24, 16), budget)
     with pretended_cuda() as pretended:
-        on_cuda = replace(budget, device="cuda")
+        on_cuda = replace(budget, learner=learner_on("cuda"))
         there = train_head([pair], -1.0, 2.0, (24, 16), on_cuda)
     assert pretended.counts["launches"] > 40
     assert here.head.to_bytes() == there.head.to_bytes()
