@@ -11,8 +11,6 @@ from dataclasses import replace
 from math import prod
 from typing import NamedTuple
 
-import numpy as np
-
 from fhash_codec.compact.attempt import (
     FAST_BYTES,
     Attempt,
@@ -31,7 +29,7 @@ from fhash_codec.compact.goal import (
 )
 from fhash_codec.compact.head import choose_head, expected_share, least_gain, training_pairs
 from fhash_codec.compact.head_training import foretold_gain
-from fhash_codec.compact.planner import block_of, by_prices, in_part, part_costs
+from fhash_codec.compact.planner import Priced, by_prices, in_part, part_costs
 from fhash_codec.compact.predictor import choose_predictor
 from fhash_codec.compact.sample import Sample, mask_levels
 from fhash_codec.compact.tiles import (
@@ -44,10 +42,7 @@ from fhash_codec.compact.tiles import (
     return_memory,
 )
 from fhash_codec.compact.transform import (
-    NONE,
-    Bases,
     Magnitudes,
-    in_plane,
     magnitudes_of,
     magnitudes_of_all,
     moved_transform,
@@ -57,7 +52,6 @@ from fhash_codec.compact.transform import (
     weighted,
 )
 from fhash_codec.progress import skip, stage, tell
-from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
 
 CODED_PART = 1 << 18
@@ -104,31 +98,48 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
 def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     """Return the plan of a series, with the step that should keep the promise.
 
-    Where vertices do not count, one plan keeps the values that are there, and another fills them:
-    that of the fewer bytes is taken.
+    Vertices that do not count keep the values that are there, or are filled, whichever takes the
+    fewer bytes.
 
     settings: with a first guess of the step.
     """
     task.parts.begin("tiles and transform")
-    view = in_part(task.blocks)
-    attempt = _planned(task, view, settings, 0)
+    view, density = in_part(task.blocks), 0
+    tiled, settings, found = _priced(task, view, settings, density)
     if not task.blocks.complete and task.asks("filling"):
         task.parts.begin("fill values")
-        attempt = _with_filling(task, view, attempt)
-    return attempt
+        share = _share_of_filled(task, tiled, settings)
+        tell("filling", f"filled parts take {share:.2f} times the bytes")
+        density = task.density if share < 1 else 0
+        found = replace(found, size=min(share, 1.0) * found.size)
+        if share < MISLED:
+            tiled, settings, found = _priced(task, view, settings, density)
+    return _with_step(task, tiled, settings, found, density)
 
 
-def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int) -> Attempt:
-    """Return a plan by prices, with the coder and the step by coded parts.
+def _priced(
+    task: PlanTask, view: Blocks, settings: TileSettings, density: int
+) -> tuple[Blocks, TileSettings, Priced]:
+    """Return the tiles, the settings and the plan by prices.
 
     view: the series, or parts of it.
     settings: with a guess of the step.
     density: thoroughness of filling vertices that do not count; 0 keeps what is there.
     """
-    goal, config = task.goal, task.config
     with stage("plan", "tiles, transform and step, by prices of some parts"):
-        tiled, settings, found = by_prices(task, view, settings, density)
+        found = by_prices(task, view, settings, density)
     return_memory()
+    return found
+
+
+def _with_step(
+    task: PlanTask, tiled: Blocks, settings: TileSettings, found: Priced, density: int
+) -> Attempt:
+    """Return a plan by prices with its coder and its step, by coded parts.
+
+    density: as in `_priced`.
+    """
+    goal, config = task.goal, task.config
     tiling = None
     if task.fixed_tile is None and config.effort > 1:
         tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
@@ -147,69 +158,29 @@ def _planned(task: PlanTask, view: Blocks, settings: TileSettings, density: int)
     return replace(attempt, tiling=tiling)
 
 
-COMPARED_VERTICES = 5 << 18
-"""Vertices of the block on which plans are compared: of half as many, bases are not worth it."""
 TRIAL_DENSITY = 2
-"""Thoroughness of filling there: more of it changed no choice."""
+"""Thoroughness of filling where its bytes are tried: more of it changed no choice."""
+MISLED = 0.5
+"""Share of the bytes that filled vertices leave below which prices of the values that were there
+chose other tiles: 7 % of the bytes where it is a third."""
 
 
-def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
-    """Return the plan that keeps the values where none count, or one that fills them.
-
-    Both code the same block, since prices of parts of different tiles do not compare.
+def _share_of_filled(task: PlanTask, tiled: Blocks, settings: TileSettings) -> float:
+    """Return the bytes of parts whose uncounted vertices are filled, as a multiple of those that
+    they take with the values that are there.
     """
-    filled = _planned(task, view, present.settings, task.density)
-    shape = block_of(view.shape, COMPARED_VERTICES)
-    cut = view.retile(shape)
-    costs = part_costs(task, cut, present.settings)
-    assert costs is not None
-    index = list(cut.indices())[int(np.argmax(costs))]
-    t, z, y, x = (number * n for number, n in zip(index, shape, strict=True))
-    block = view.boxes(shape, [(t, z, y, x)], [1])
-    filled, size = _tried_filled(task, view, block, filled)
-    kept = _size_of(task, block, present)
-    tell("filling", f"a block takes {kept:.0f} bytes as it is, {size:.0f} filled")
-    return present if kept <= size else filled
+    kept = coded_parts(task, tiled, settings)
+    moved = moved_transform(kept, settings)
+    coding = task.goal.bounded(with_fill(coding_of(task.config.effort, fast=True)))
 
+    def size(parts: Sample) -> float:
+        outcome = parts.run(moved, coding)
+        if task.goal.psnr is not None:
+            step = step_after(moved, outcome, task.goal)
+            outcome = parts.run(replace(moved, step=step), coding)
+        return _at_promise(outcome, task.goal)
 
-def _size_of(task: PlanTask, block: Blocks, attempt: Attempt) -> float:
-    """Return the bytes that a block takes by a plan where the promise is kept."""
-    sample = Sample(block.retile(attempt.sample.blocks.tile), 1 << 62, task.workers)
-    settings, coding = moved_transform(sample, attempt.settings), task.goal.bounded(attempt.coding)
-    outcome = sample.run(settings, coding)
-    if task.goal.psnr is not None:
-        step = step_after(settings, outcome, task.goal)
-        outcome = sample.run(replace(settings, step=step), coding)
-    return _at_promise(outcome, task.goal)
-
-
-def _tried_filled(
-    task: PlanTask, view: Blocks, block: Blocks, attempt: Attempt
-) -> tuple[Attempt, float]:
-    """Return a plan that fills vertices with the best transform, and the bytes of a block.
-
-    No price tells it, since a filling suits the transform that it was made for: here it goes on for
-    each.
-    """
-    tile = attempt.sample.blocks.tile
-    bases = Bases(Sample(view.retile(tile), 1, task.workers), attempt.settings)
-    t, z, y, x = attempt.settings.transform.axes
-    plane = in_plane("9/7", 3, tile)
-    trials = [(t, z, y, x), (NONE, z, y, x), (NONE, NONE, plane[2], plane[3])]
-    if bases.possible(*tile[1:]):
-        trials.append((t, bases.along(1), bases.along(2), bases.along(3)))
-    sample = Sample(block.retile(tile), 1 << 62, task.workers)
-    sample = sample.filled(moved_transform(sample, attempt.settings), TRIAL_DENSITY)
-    coding = task.goal.bounded(replace(attempt.coding, density=0))
-    best, least = attempt, math.inf
-    for axes in dict.fromkeys(trials):
-        settings = replace(attempt.settings, transform=TransformSpec(axes=axes))
-        outcome = sample.run(moved_transform(sample, settings), coding)
-        size = _at_promise(outcome, task.goal)
-        if size < least:
-            step = step_after(settings, outcome, task.goal)
-            best, least = replace(attempt, settings=with_step(settings, step, task.goal)), size
-    return best, least
+    return size(kept.filled(moved, TRIAL_DENSITY)) / max(size(kept), 1.0)
 
 
 def coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
