@@ -115,10 +115,10 @@ public:
         products(input.data(), INPUTS, one.integers.data(), one.outputs, activations[0].data(),
                  BLOCK);
         activate(activations[0].data(), two.inputs, one.scale * (ACTIVATION_UNIT / INPUT_UNIT),
-                 one.used_biases.data(), 1);
+                 one.used_biases.data());
         products(activations[0].data(), two.inputs, two.integers.data(), two.outputs,
                  activations[1].data(), BLOCK);
-        activate(activations[1].data(), two.outputs, two.scale, two.used_biases.data(), 1);
+        activate(activations[1].data(), two.outputs, two.scale, two.used_biases.data());
         products(activations[1].data(), three.inputs, three.integers.data(), 1, error.data(),
                  BLOCK);
         const int64_t at = block * BLOCK;
@@ -132,17 +132,17 @@ public:
         Layer &one = layers[0], &two = layers[1], &three = layers[2];
         gather(error_slopes.data(), BLOCK, 1, activations[1].data(), three.inputs,
                three.weight_sums.data());
-        gather_biases(error_slopes.data(), 1, 1, three.bias_sums.data());
+        gather_biases(error_slopes.data(), 1, three.bias_sums.data());
         products(error_slopes.data(), 1, three.transposed.data(), two.outputs, slopes[1].data(),
                  BLOCK);
         descend(slopes[1].data(), two.outputs, three.scale, activations[1].data());
         gather(slopes[1].data(), BLOCK, two.outputs, activations[0].data(), two.inputs,
                two.weight_sums.data());
-        gather_biases(slopes[1].data(), 1, two.outputs, two.bias_sums.data());
+        gather_biases(slopes[1].data(), two.outputs, two.bias_sums.data());
         products(slopes[1].data(), two.outputs, two.transposed.data(), two.inputs,
                  slopes[0].data(), BLOCK);
         descend(slopes[0].data(), two.inputs, two.scale, activations[0].data());
-        gather_biases(slopes[0].data(), 1, one.outputs, one.bias_sums.data());
+        gather_biases(slopes[0].data(), one.outputs, one.bias_sums.data());
         // `input` is still that of `forward`.
         gather(slopes[0].data(), BLOCK, one.outputs, input.data(), INPUTS,
                one.weight_sums.data());

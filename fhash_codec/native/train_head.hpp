@@ -167,14 +167,12 @@ FHASH_CLONES_512 EXACT_SUMS void gather(const double* slopes, int64_t stride, in
         gather_rows<1>(slopes + o * stride, stride, inputs, n, sums + o * n * LANES);
 }
 
-// sums[o] += sum over the voxels of a block of slopes[o], each in eight lanes; `each` blocks follow
-// one another for each o.
-FHASH_CLONES_512 void gather_biases(const double* FHASH_RESTRICT slopes, int64_t each,
-                                    int64_t outputs, double* FHASH_RESTRICT sums) {
+// sums[o] += sum over the voxels of a block of slopes[o], each in eight lanes.
+FHASH_CLONES_512 void gather_biases(const double* FHASH_RESTRICT slopes, int64_t outputs,
+                                    double* FHASH_RESTRICT sums) {
     for (int64_t o = 0; o < outputs; ++o)
-        for (int64_t v = 0; v < each * BLOCK; v += LANES)
-            for (int64_t i = 0; i < LANES; ++i)
-                sums[o * LANES + i] += slopes[o * each * BLOCK + v + i];
+        for (int64_t v = 0; v < BLOCK; v += LANES)
+            for (int64_t i = 0; i < LANES; ++i) sums[o * LANES + i] += slopes[o * BLOCK + v + i];
 }
 
 FHASH_CLONES_512 void widened(const int16_t* FHASH_RESTRICT in, double* FHASH_RESTRICT out) {
@@ -183,9 +181,9 @@ FHASH_CLONES_512 void widened(const int16_t* FHASH_RESTRICT in, double* FHASH_RE
 
 // Sums to activations: leaky, clipped, rounded half to even.
 FHASH_CLONES_512 void activate(double* FHASH_RESTRICT values, int64_t outputs, double scale,
-                           const double* FHASH_RESTRICT biases, int64_t each) {
+                               const double* FHASH_RESTRICT biases) {
     for (int64_t o = 0; o < outputs; ++o) {
-        const double bias = biases[o / each] * ACTIVATION_UNIT;
+        const double bias = biases[o] * ACTIVATION_UNIT;
         for (int64_t i = 0; i < BLOCK; ++i) {
             const double p = values[o * BLOCK + i] * scale + bias;
             const double less = 0.125 * p;
