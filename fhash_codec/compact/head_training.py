@@ -20,11 +20,11 @@ from fhash_formats.transform.head import (
     INPUTS,
     MAX_BIAS,
     MAX_WEIGHT,
-    OFFSETS,
     SIGMA_RANGE,
     Layer,
     NeighbourHead,
     Scaled,
+    offsets_in,
 )
 from fhash_formats.transform.spec import checked
 
@@ -211,7 +211,7 @@ def _fill_slots(
         np.array(decoded.shape, np.int64),
         np.ascontiguousarray(places[:, order], np.int64),
         np.ascontiguousarray(slots[order], np.int64),
-        np.array(OFFSETS, np.int64),
+        offsets_in(decoded.shape[0]),
     )
     tile, shape, at, to, neighbours = map(pointer, arrays)
     code = checked(

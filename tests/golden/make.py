@@ -295,7 +295,7 @@ def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
     def coded(*arguments: Any, **options: Any) -> CodedTable:
         table = code(*arguments, **options)
         settings = replace(table.plan.settings, head=head())
-        return replace(table, plan=replace(table.plan, settings=settings))
+        return replace(table, plan=replace(table.plan, settings=settings), decoded={})
 
     with (
         mock.patch.object(compact, "code_series", coded),

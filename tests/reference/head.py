@@ -35,10 +35,11 @@ def _diagonal(one: int, other: int) -> list[tuple[int, ...]]:
 
 OFFSETS = [
     *(place for axis in range(4) for place in _along(axis, -1, 1)),
-    *(place for axis in (1, 2, 3) for place in _along(axis, -2, 2)),
-    *(place for pair in ((2, 3), (1, 3), (1, 2)) for place in _diagonal(*pair)),
+    *(place for axis in (0, 2, 3) for place in _along(axis, -2, 2)),
+    *(place for pair in ((2, 3), (0, 3), (0, 2)) for place in _diagonal(*pair)),
 ]
-"""The 26 neighbours of a vertex, along t, z, y, x, in the order of the inputs."""
+"""The 26 neighbours of a vertex, along t, z, y, x, in the order of the inputs. Where there is one
+step, those along t are along z."""
 
 
 class Layer(NamedTuple):
@@ -60,7 +61,7 @@ class Head(NamedTuple):
 
 def unpack_head(data: bytes) -> Head:
     """The head of its packed bytes."""
-    count = data[0]
+    count = data[0] - 16
     widths = [*data[1 : 1 + count], 1]
     inputs = [len(OFFSETS) + 2, *widths[:-1]]
     sigma, low, high = (np.float32(v) for v in struct.unpack_from("<3f", data, 1 + count))
@@ -119,7 +120,8 @@ def inputs_of(values: Floats, head: Head) -> list[Floats]:
     """The 28 inputs of each vertex, from clipped values: differences of its neighbours, its
     position in the range, and its distance from the lower end."""
     inverse = np.float32(0.5) / head.sigma
-    inputs = [compress((moved(values, place) - values) * inverse) for place in OFFSETS]
+    places = [(0, t + z, y, x) if len(values) == 1 else (t, z, y, x) for t, z, y, x in OFFSETS]
+    inputs = [compress((moved(values, place) - values) * inverse) for place in places]
     span = head.high - head.low
     unit = np.float32(1024) / span if span > 0 else np.float32(0)
     unit = unit if np.isfinite(unit) else np.float32(0)

@@ -172,9 +172,9 @@ inline void apply(Frames& frames, const Kernels& kernels, const Stage* stages,
     Rooms rooms;
     Last last;
     const Rows seen = frames.around(some);
-    frames.load(0, seen);
+    for (std::int64_t step = 0; step < HALO && step < frames.t; ++step) frames.load(step, seen);
     for (std::int64_t step = 0; step < frames.t; ++step) {
-        if (step + 1 < frames.t) frames.load(step + 1, seen);
+        if (step + HALO < frames.t) frames.load(step + HALO, seen);
         correct(frames, kernels, stages, layers, step, some, rooms, last, out);
     }
 }

@@ -75,8 +75,7 @@ struct Rows {
     std::int64_t begin, end;
 };
 
-// The clipped frames t - 1, t and t + 1 of a tile, with edges repeated, and the inputs of their
-// voxels.
+// The clipped frames around one of a tile, with edges repeated, and the inputs of its voxels.
 class Frames {
 public:
     const std::int64_t t, z, y, x, rows, blocks, pitch, held;
@@ -89,7 +88,7 @@ public:
           rows(z * y),
           blocks((x + BLOCK - 1) / BLOCK),
           pitch(blocks * BLOCK + 2 * HALO),
-          held(t < 3 ? t : 3),
+          held(t < STEPS ? t : STEPS),
           range(bounds),
           decoded(source),
           frames(new (std::nothrow) float[held * rows * pitch]),
@@ -116,14 +115,17 @@ public:
 
     // The rows of the neighbours of row r of a frame.
     FHASH_INLINE void neighbours(std::int64_t step, std::int64_t r, std::int64_t* row_of) const {
-        std::int64_t ts[3], zs[5], ys[5];
+        std::int64_t ts[STEPS], zs[STEPS], ys[STEPS];
         const std::int64_t zi = r / y, yi = r % y;
-        for (int d = 0; d < 3; ++d) ts[d] = row(clamped(step + d - 1, t), 0, 0);
-        for (int d = 0; d < 5; ++d) zs[d] = clamped(zi + d - 2, z) * y;
-        for (int d = 0; d < 5; ++d) ys[d] = clamped(yi + d - 2, y);
+        for (int d = 0; d < STEPS; ++d) {
+            zs[d] = clamped(zi + d - HALO, z) * y;
+            ys[d] = clamped(yi + d - HALO, y);
+            ts[d] = t > 1 ? row(clamped(step + d - HALO, t), 0, 0) : zs[d] - zi * y;
+        }
         FHASH_UNROLLED
         for (int k = 0; k < NEIGHBOURS; ++k)
-            row_of[k] = ts[OFFSETS[k][0] + 1] + zs[OFFSETS[k][1] + 2] + ys[OFFSETS[k][2] + 2];
+            row_of[k] = ts[OFFSETS[k][0] + HALO] + zs[OFFSETS[k][1] + HALO] +
+                        ys[OFFSETS[k][2] + HALO];
     }
 
     const float* block(std::int64_t row_index, std::int64_t b) const {

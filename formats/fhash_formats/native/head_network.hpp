@@ -16,19 +16,21 @@ namespace {
 constexpr std::int64_t BLOCK = 64;   // most voxels along x that are evaluated together
 constexpr std::int64_t GROUP = 16;   // the voxels of a shorter block are a multiple of this
 constexpr std::int64_t HALO = 2;     // the farthest neighbour along an axis
+constexpr std::int64_t STEPS = 2 * HALO + 1;  // that a voxel's neighbours lie in
 constexpr std::int64_t INPUTS = 28;  // 26 neighbours, two functions of the centre
 constexpr std::int64_t NEIGHBOURS = INPUTS - 2;
 constexpr std::int64_t MAX_WIDTH = 64;
 constexpr std::int64_t MAX_LAYERS = 4;
 constexpr std::int64_t MAX_PAIRS = (MAX_WIDTH + 8) / 2;  // of a layer's inputs or outputs
 
-// Offsets along (t, z, y, x) to the neighbours, in the order of the inputs.
+// Offsets along (t, z, y, x) to the neighbours, in the order of the inputs. In a tile of one step
+// those along t are along z.
 constexpr int OFFSETS[NEIGHBOURS][4] = {
     {-1, 0, 0, 0},   {1, 0, 0, 0},   {0, -1, 0, 0},  {0, 1, 0, 0},  {0, 0, -1, 0}, {0, 0, 1, 0},
-    {0, 0, 0, -1},   {0, 0, 0, 1},   {0, -2, 0, 0},  {0, 2, 0, 0},  {0, 0, -2, 0}, {0, 0, 2, 0},
+    {0, 0, 0, -1},   {0, 0, 0, 1},   {-2, 0, 0, 0},  {2, 0, 0, 0},  {0, 0, -2, 0}, {0, 0, 2, 0},
     {0, 0, 0, -2},   {0, 0, 0, 2},   {0, 0, -1, -1}, {0, 0, -1, 1}, {0, 0, 1, -1}, {0, 0, 1, 1},
-    {0, -1, 0, -1},  {0, -1, 0, 1},  {0, 1, 0, -1},  {0, 1, 0, 1},  {0, -1, -1, 0}, {0, -1, 1, 0},
-    {0, 1, -1, 0},   {0, 1, 1, 0},
+    {-1, 0, 0, -1},  {-1, 0, 0, 1},  {1, 0, 0, -1},  {1, 0, 0, 1},  {-1, 0, -1, 0}, {-1, 0, 1, 0},
+    {1, 0, -1, 0},   {1, 0, 1, 0},
 };
 
 // A network as the caller gives it.

@@ -10,7 +10,7 @@ namespace fhash {
 namespace {
 
 constexpr int64_t SHARE = 4;  // a part is corrected alone where its head sees a SHARE-th of frames
-const int64_t REACH[4] = {1, 2, 2, 2};  // farthest vertices that the inputs of a head come from
+constexpr int64_t REACH = 2;  // farthest vertex along an axis that the inputs of a head come from
 
 // A part: first vertices along t, z, y, x, and those after the last.
 struct Part {
@@ -25,8 +25,8 @@ struct Part {
 Part widened(const Part& part, const Shape& shape) {
     Part wide;
     for (int a = 0; a < 4; a++) {
-        wide.first[a] = std::max<int64_t>(0, part.first[a] - REACH[a]);
-        wide.last[a] = std::min(shape[(size_t)a], part.last[a] + REACH[a]);
+        wide.first[a] = std::max<int64_t>(0, part.first[a] - REACH);
+        wide.last[a] = std::min(shape[(size_t)a], part.last[a] + REACH);
     }
     return wide;
 }

@@ -241,12 +241,17 @@ bool no_head(fhash_error& error, const char* what) {
                 "the settings of a coded tile are damaged: a damaged neighbourhood head: %s", what);
 }
 
+// What is added to the number of hidden layers since heads look along t, too: in no file of before.
+constexpr uint8_t HEAD_MARK = 16;
+
 // The widths of the layers of a head.
 bool read_widths(Bytes& data, Head& head, fhash_error& error) {
     constexpr int MAX_HIDDEN = 3, MAX_WIDTH = 64;
     uint8_t count;
     const uint8_t* widths;
     if (!data.number(count)) return no_head(error, "it is cut");
+    if (count < HEAD_MARK) return no_head(error, "it looks at other neighbours");
+    count = uint8_t(count - HEAD_MARK);
     if (count < 1 || count > MAX_HIDDEN || !data.take(count, widths))
         return no_head(error, "its hidden layers");
     head.widths = {28};

@@ -26,14 +26,30 @@ OFFSETS: tuple[tuple[int, int, int, int], ...] = (
     *((0, offset, 0, 0) for offset in (-1, 1)),
     *((0, 0, offset, 0) for offset in (-1, 1)),
     *((0, 0, 0, offset) for offset in (-1, 1)),
-    *((0, offset, 0, 0) for offset in (-2, 2)),
+    *((offset, 0, 0, 0) for offset in (-2, 2)),
     *((0, 0, offset, 0) for offset in (-2, 2)),
     *((0, 0, 0, offset) for offset in (-2, 2)),
     *((0, 0, first, second) for first in (-1, 1) for second in (-1, 1)),
-    *((0, first, 0, second) for first in (-1, 1) for second in (-1, 1)),
-    *((0, first, second, 0) for first in (-1, 1) for second in (-1, 1)),
+    *((first, 0, 0, second) for first in (-1, 1) for second in (-1, 1)),
+    *((first, 0, second, 0) for first in (-1, 1) for second in (-1, 1)),
 )
-"""Offsets along (t, z, y, x) from a voxel to its 26 neighbours, in the order of the inputs."""
+"""Offsets along (t, z, y, x) from a voxel to its 26 neighbours, in the order of the inputs.
+
+In a tile of one step those along t are along z. With the diagonals of t in place of those of z an
+MLP of the same size gains 0.07 to 0.5 dB more."""
+
+
+def offsets_in(steps: int) -> npt.NDArray[np.int64]:
+    """The offsets (26, 4) to the neighbours in a tile of some steps."""
+    offsets = np.array(OFFSETS, np.int64)
+    if steps == 1:
+        offsets[:, 1] += offsets[:, 0]
+        offsets[:, 0] = 0
+    return offsets
+
+
+_MARK = 16
+"""What is added to the number of hidden layers since heads look along t: in no file of before."""
 
 
 INPUTS = len(OFFSETS) + 2
@@ -321,13 +337,13 @@ class NeighbourHead:
     def to_bytes(self) -> bytes:
         """The packed head; `from_bytes` is the inverse. All numbers are little-endian.
 
-        First u8 the number of hidden layers, and u8 the width of each; float32 sigma, low, high;
-        per layer float16 the scales of weights and biases, and u8 the spread; then the biases of
-        all layers as int8; then the weights of all layers, row by row, in one big integer.
+        First u8 16 + the number of hidden layers, and u8 the width of each; float32 sigma, low,
+        high; per layer float16 the scales of weights and biases, and u8 the spread; then the
+        biases of all layers as int8; then the weights of all layers, row by row, in one integer.
         """
         spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
         fields = [
-            bytes([len(self.hidden), *self.hidden]),
+            bytes([_MARK + len(self.hidden), *self.hidden]),
             struct.pack("<3f", self.sigma, self.low, self.high),
         ]
         for layer, spread in zip(self.layers, spreads, strict=True):
@@ -353,7 +369,9 @@ class NeighbourHead:
     @classmethod
     def _read(cls, data: bytes) -> NeighbourHead:
         """The head in some bytes. Raises ValueError, IndexError or struct.error for others."""
-        count = data[0]
+        if data[0] < _MARK:
+            raise ValueError("it looks at other neighbours: of a version before the release")
+        count = data[0] - _MARK
         if not 1 <= count <= MAX_HIDDEN:
             raise ValueError(f"{count} hidden layers")
         widths = [*data[1 : 1 + count], 1]

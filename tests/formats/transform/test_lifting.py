@@ -359,7 +359,7 @@ def test_other_tiles_are_refused(tile: npt.NDArray[Any]) -> None:
 @pytest.mark.parametrize("hidden", [(12, 8), (1,), (24, 12), (64, 64, 64)])
 def test_bytes_there_and_back(hidden: tuple[int, ...]) -> None:
     head = random_head(hidden)
-    assert head.to_bytes()[0] == len(hidden)
+    assert head.to_bytes()[0] == 16 + len(hidden)
     again = NeighbourHead.from_bytes(head.to_bytes())
     assert (again.hidden, again.sigma, again.low, again.high) == (
         head.hidden,
@@ -394,18 +394,24 @@ def test_damaged_bytes_are_refused_or_are_another_sound_head(head: NeighbourHead
 @pytest.mark.parametrize(
     "start",
     [
-        b"\x00",
-        b"\x04\x04\x04\x04\x04",
-        b"\x82\x04\x04",
-        b"\x02\x04",
-        b"\x02\x04\x41",
-        b"\x02\x00\x04",
+        b"\x10",
+        b"\x14\x04\x04\x04\x04",
+        b"\x92\x04\x04",
+        b"\x12\x04",
+        b"\x12\x04\x41",
+        b"\x12\x00\x04",
     ],
 )
 def test_other_hidden_layers_are_refused(start: bytes) -> None:
     rest = random_head((4, 4)).to_bytes()[3:]
     with pytest.raises(DamagedFileError, match=r"hidden layers|widths"):
         NeighbourHead.from_bytes(start + rest if len(start) > 2 else start)
+
+
+def test_a_head_that_looked_at_other_neighbours_is_refused() -> None:
+    data = random_head((4, 4)).to_bytes()
+    with pytest.raises(DamagedFileError, match="other neighbours"):
+        NeighbourHead.from_bytes(bytes([data[0] - 16]) + data[1:])
 
 
 @pytest.mark.parametrize(
