@@ -49,7 +49,7 @@ def offsets_in(steps: int) -> npt.NDArray[np.int64]:
 
 
 _MARK = 16
-"""What is added to the number of hidden layers since heads look along t: in no file of before."""
+"""Addend of the number of hidden layers since heads look along t: in no file of before."""
 
 
 INPUTS = len(OFFSETS) + 2
