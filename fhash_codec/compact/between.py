@@ -16,11 +16,12 @@ from fhash_codec.features.key_frames import KeyTimes, time_axis
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_formats.container.header import BETWEEN, CUBIC, LINEAR
 from fhash_formats.series import Series
+from fhash_formats.support.values import Longs
 
-LEFT_OUT = 8
+LEFT_OUT = 16
 """Steps that are left out to choose the rule, at most."""
 READ = 7
-"""Frames that are held for it: of neighbouring steps that are left out, none is read twice."""
+"""Frames that are held for it: of neighbours that are left out, none is read twice."""
 VERTICES = 4096
 """Vertices that are compared at each of them, at most: a millisecond."""
 
@@ -37,21 +38,22 @@ def choose_between(series: Series, extent: Extent, value_range: ValueRange) -> d
     scale, squares = power_of_two(width), np.zeros(2)
     times = time_axis(series.coords["t"].values)
 
-    @lru_cache(maxsize=READ)
-    def frame(step: int) -> npt.NDArray[Any]:
-        return series.frame(step).reshape(-1)
-
+    frame = lru_cache(maxsize=READ)(lambda step: series.frame(step).reshape(-1))
     for left_out in np.unique(np.linspace(1, count - 2, LEFT_OUT).round().astype(int)).tolist():
-        keys = tuple(key for key in range(left_out - 3, left_out + 4, 2) if 0 <= key < count)
-        key_times, first = KeyTimes(times=times, key_frames=keys), keys.index(left_out - 1)
+        around = range(left_out - 3, left_out + 4, 2)
+        keys = tuple(key for key in around if 0 <= key < count)
         vertices = _vertices(extent, range(left_out - 1, left_out + 2))
         held = {key: scale * frame(key)[vertices].astype(np.float64) for key in (*keys, left_out)}
-        frames = [held.get(key) for key in range(left_out - 3, left_out + 4, 2)]
+        for key in keys:
+            held[key][~_in_coreset(extent, key, vertices)] = np.nan
+        frames = [held.get(key) for key in around]
+        key_times, first = KeyTimes(times=times, key_frames=keys), keys.index(left_out - 1)
         distances = key_times.distances(first)
         share = np.array([key_times.key_index(left_out) - first])
         linear, _ = values_between([None, *frames[1:3], None], distances, share)
         cubic, _ = values_between(frames, distances, share)
-        errors = np.square(np.stack([linear, cubic]) - held[left_out])
+        with np.errstate(invalid="ignore", over="ignore"):  # of values that are not finite
+            errors = np.square(np.stack([linear, cubic]) - held[left_out])
         squares += errors[:, np.isfinite(errors).all(axis=0)].sum(axis=1)
     if squares[0] == squares[1]:
         return {}
@@ -60,13 +62,12 @@ def choose_between(series: Series, extent: Extent, value_range: ValueRange) -> d
     return {BETWEEN: {"rule": rule, "gain_db": None if gain is None else round(gain, 2)}}
 
 
-def _vertices(extent: Extent, steps: range) -> npt.NDArray[np.int64]:
+def _vertices(extent: Extent, steps: range) -> Longs:
     """Return vertices of a frame that are in the coreset at all of some steps.
 
     They follow the golden ratio, so that no row or column is preferred.
     """
-    vertices: npt.NDArray[np.int64] | None = None
-    size = math.prod(extent.domain)
+    size, vertices = math.prod(extent.domain), None
     if extent.fraction < 1:
         packed = np.bitwise_and.reduce(extent.packed[steps.start : steps.stop])
         vertices = np.flatnonzero(np.unpackbits(packed, count=size))
@@ -74,3 +75,8 @@ def _vertices(extent: Extent, steps: range) -> npt.NDArray[np.int64]:
     spread = np.arange(min(VERTICES, size)) * GOLDEN_RATIO % 1.0 * size
     chosen = spread.astype(np.int64)
     return chosen if vertices is None else vertices[chosen]
+
+
+def _in_coreset(extent: Extent, step: int, vertices: Longs) -> npt.NDArray[np.bool_]:
+    """Return which vertices of a frame are in the coreset at a step."""
+    return (extent.packed[step][vertices >> 3] >> (7 - (vertices & 7)) & 1).astype(np.bool_)
