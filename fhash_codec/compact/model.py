@@ -14,10 +14,10 @@ import numpy.typing as npt
 from fhash_codec.boxes import NEIGHBOURS, Box, Mlp, Table, ceil_halvings
 from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import read_occupancy
-from fhash_codec.header import read_missing
+from fhash_codec.header import read_missing, rule_between
 from fhash_codec.measure.value_range import decoded_type
 from fhash_formats.container import Container, StoredArray
-from fhash_formats.container.header import BETWEEN, CUBIC, MISSING_ARRAY, PLAIN_FEATURE, TABLE
+from fhash_formats.container.header import CUBIC, MISSING_ARRAY, PLAIN_FEATURE, TABLE
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import library
 from fhash_formats.support.threads import chunk_region, common_part
@@ -389,7 +389,7 @@ class CompactModel:
             self._plain = PlainArray(container.header["model"], self._arrays)
         self._array = self._plain or self._table
         self.chunks = self._array.chunk_shape
-        self._cubic = container.header["model"].get(BETWEEN, {}).get("rule") == CUBIC
+        self._cubic = rule_between(container.header)["rule"] == CUBIC
 
     @cached_property
     def _key_times(self) -> KeyTimes:

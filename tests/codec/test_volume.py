@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from reference.between import value_between
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, RegionError
@@ -22,7 +23,6 @@ from fhash_codec.measure.value_range import decoded_type
 from fhash_codec.volume import Volume, feature_names, holds_features_apart, only_features, rounded
 from fhash_formats.container import StoredArray
 from fhash_formats.series import ArraySeries, Coordinate
-from reference.between import value_between
 
 LOW, HIGH = "interval:0:0.2", "interval:0.8:1"
 KEY_FRAMES = (0, 2, 3)
