@@ -356,22 +356,30 @@ def values_between(
     shares: float64 (n,), or one for all values.
     slopes: whether to return derivatives by the share; None is returned for them otherwise.
     """
-    held = [None if each is None else np.ascontiguousarray(each, np.float64) for each in frames]
-    given = held[1]
-    assert given is not None
-    values, derived = np.empty(given.shape), np.empty(given.shape) if slopes else None
+    given = [None if each is None else each.reshape(-1) for each in frames]
+    shape = next(each.shape for each in frames if each is not None)
+    values, derived = np.empty(shape), np.empty(shape) if slopes else None
+    # Piece by piece, so that copies in float64 stay in the cache.
     shares = np.ascontiguousarray(shares)
-    code = library().fhash_between(
-        (ctypes.c_void_p * 4)(*(None if each is None else each.ctypes.data for each in held)),
-        (ctypes.c_double * 2)(*distances),
-        values.size,
-        shares.ctypes.data,
-        shares.size,
-        values.ctypes.data,
-        None if derived is None else derived.ctypes.data,
-    )
-    assert code == 0
+    piece = shares.size if shares.size > 1 else BLOCK
+    for start in range(0, values.size, piece):
+        held = [None if each is None else _wide(each[start : start + piece]) for each in given]
+        code = library().fhash_between(
+            (ctypes.c_void_p * 4)(*(None if each is None else each.ctypes.data for each in held)),
+            (ctypes.c_double * 2)(*distances),
+            min(piece, values.size - start),
+            shares.ctypes.data,
+            shares.size == 1,
+            values.ctypes.data + 8 * start,
+            None if derived is None else derived.ctypes.data + 8 * start,
+        )
+        assert code == 0
     return values, derived
+
+
+def _wide(values: npt.NDArray[Any]) -> Double:
+    """Return values in float64, side by side."""
+    return np.ascontiguousarray(values, np.float64)
 
 
 class CompactModel:

@@ -1,4 +1,5 @@
-// Values between two steps, of one vertex and of many.
+#include "loops.hpp"
+
 #include "between.hpp"
 
 #include <algorithm>
@@ -11,53 +12,87 @@ namespace fhash {
 
 namespace {
 
-// The change from the first step to the second that the slope at one of them stands for. `rise` is
-// the change itself, `other` that on the other side of the step, `distance` away. At an end of the
-// series, and where the value on the other side is missing, the slope is that of the secant.
-double slope_at(double rise, double other, double distance) {
-    const double beside = other / distance;
-    if (!(std::isfinite(beside) && std::isfinite(distance) && distance > 0)) return rise;
-    if ((beside > 0) != (rise > 0) || beside == 0 || rise == 0) return 0;
-    return (3 + 3 * distance) / ((2 + distance) / beside + (1 + 2 * distance) / rise);
+constexpr int64_t BLOCK = 256;  // values that are worked on together
+
+// A block of values, each of the arrays `n` long; `before`, `behind` and `slopes` may be null.
+struct Block {
+    const double *before, *first, *second, *behind, *shares;
+    double *values, *slopes;
+    int64_t n;
+};
+
+FHASH_INLINE bool finite(double value) {
+    return std::fabs(value) <= std::numeric_limits<double>::max();
 }
+
+// By how much the slope at a step is above that of the secant between the two steps, from `first`
+// to `second`. On the other side of the step the change is from `one` to `two`, `distance` long.
+FHASH_INLINE void bends_at(const Block& block, const double* one, const double* two,
+                           double distance, double* FHASH_RESTRICT out) {
+    const double *first = block.first, *second = block.second;
+    const double own = 1 + 2 * distance, others = 2 + distance;
+    for (int64_t i = 0; i < block.n; i++) {
+        const double rise = second[i] - first[i], beside = (two[i] - one[i]) / distance;
+        const double mean = (3 + 3 * distance) / (others / beside + own / rise);
+        const double slope = beside * rise > 0 ? mean : 0.0;
+        out[i] = finite(beside) ? slope - rise : 0.0;  // no value there: the slope is the secant's
+    }
+}
+
+FHASH_INLINE void work(const Block& block, const Beside& beside) {
+    double left[BLOCK] = {}, right[BLOCK] = {};
+    if (block.before) bends_at(block, block.before, block.first, beside.before, left);
+    if (block.behind) bends_at(block, block.second, block.behind, beside.behind, right);
+    const double *first = block.first, *second = block.second, *shares = block.shares;
+    double* const slopes = block.slopes;
+    const int64_t sloped = slopes ? block.n : 0;
+    FHASH_INDEPENDENT
+    for (int64_t i = 0; i < sloped; i++) {
+        const double at = shares[i], rest = 1 - at, rise = second[i] - first[i];
+        const double bend = left[i] * rest - right[i] * at;
+        const double slope = rise + (rest - at) * bend - at * rest * (left[i] + right[i]);
+        slopes[i] = finite(slope) ? slope : rise;
+    }
+    double* const values = block.values;
+    FHASH_INDEPENDENT
+    for (int64_t i = 0; i < block.n; i++) {
+        const double at = shares[i], rest = 1 - at;
+        const double even = first[i] * rest + second[i] * at;
+        const double value = even + at * rest * (left[i] * rest - right[i] * at);
+        const double low = std::min(first[i], second[i]), high = std::max(first[i], second[i]);
+        const double clipped = std::min(std::max(value, low), high);
+        const double between = finite(value) ? clipped : even;  // a difference may overflow
+        const double upper = at >= 1 ? second[i] : between;
+        values[i] = at <= 0 ? first[i] : upper;
+    }
+}
+
+FHASH_CLONES void work_on(const Block& block, const Beside& beside) { work(block, beside); }
 
 }  // namespace
 
-double value_between(double at, const Beside& beside, double before, double first, double second,
-                     double behind, double& slope) {
-    const double rise = second - first;
-    const double left = slope_at(rise, first - before, beside.before) - rise;
-    const double right = slope_at(rise, behind - second, beside.behind) - rise;
-    const double rest = 1 - at, bend = left * rest - right * at;
-    slope = rise + (rest - at) * bend - at * rest * (left + right);
-    if (!std::isfinite(slope)) slope = rise;  // a difference overflows, or there is no value
-    if (at <= 0) return first;
-    if (at >= 1) return second;
-    const double even = first * rest + second * at, value = even + at * rest * bend;
-    // Without a bend: a sum with 0 has another sign of 0.
-    if ((left == 0 && right == 0) || !std::isfinite(value)) return even;
-    return std::clamp(value, std::min(first, second), std::max(first, second));
+void values_between(const double* const* frames, const Beside& beside, int64_t n,
+                    const double* shares, bool alone, double* values, double* slopes) {
+    double own[BLOCK];
+    // Two times may be equal in float64, once they are near 1.
+    const bool held[2] = {frames[0] && beside.before > 0 && finite(beside.before),
+                          frames[3] && beside.behind > 0 && finite(beside.behind)};
+    if (alone) std::fill_n(own, BLOCK, *shares);
+    for (int64_t start = 0; start < n; start += BLOCK) {
+        const int64_t size = std::min(BLOCK, n - start);
+        work_on({held[0] ? frames[0] + start : nullptr, frames[1] + start, frames[2] + start,
+                 held[1] ? frames[3] + start : nullptr, alone ? own : shares + start,
+                 values + start,
+                 slopes ? slopes + start : nullptr, size}, beside);
+    }
 }
 
 }  // namespace fhash
 
-// frames: `n` values of the step before the two, of both, and of the step behind them; the outer
-// ones may be null. distances: as in Beside. shares: how far the points are from the first step to
-// the second, `count` of them, which repeat along the values. values: room for the values there.
-// slopes: null, or room for their derivatives by the share.
+// values_between for Python.
 FHASH_KERNEL std::int64_t fhash_between(const double* const* frames, const double* distances,
-                                        std::int64_t n, const double* shares, std::int64_t count,
+                                        std::int64_t n, const double* shares, std::int64_t alone,
                                         double* values, double* slopes) {
-    if (n < 0 || count < 1 || n % count) return -1;
-    const fhash::Beside beside = {distances[0], distances[1]};
-    const double none = std::numeric_limits<double>::quiet_NaN();
-    for (std::int64_t row = 0; row < n; row += count)
-        for (std::int64_t i = row; i < row + count; i++) {
-            double slope;
-            values[i] = fhash::value_between(shares[i - row], beside,
-                                             frames[0] ? frames[0][i] : none, frames[1][i],
-                                             frames[2][i], frames[3] ? frames[3][i] : none, slope);
-            if (slopes) slopes[i] = slope;
-        }
+    fhash::values_between(frames, {distances[0], distances[1]}, n, shares, alone, values, slopes);
     return 0;
 }

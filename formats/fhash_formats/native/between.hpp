@@ -2,6 +2,8 @@
 // Fritsch and Butland, a harmonic mean of the slopes at both sides of a step.
 #pragma once
 
+#include <cstdint>
+
 namespace fhash {
 
 // Distances from the step before the two to the first, and from the second to the step behind, in
@@ -10,9 +12,11 @@ struct Beside {
     double before = 0, behind = 0;
 };
 
-// The value at a share `at` of the way from `first` to `second`, and by `slope` its derivative by
-// that share. `before` and `behind`: values of the steps beside them, NaN for none.
-double value_between(double at, const Beside& beside, double before, double first, double second,
-                     double behind, double& slope);
+// frames: `n` values of the step before the two, of both, and of the step behind them. The outer
+// ones may be null, or NaN; without both the values are linear.
+// shares: how far each point is from the first step to the second, 0 to 1; `alone`: one for all.
+// values, slopes: room for the values there, and null or room for their derivatives by the share.
+void values_between(const double* const* frames, const Beside& beside, int64_t n,
+                    const double* shares, bool alone, double* values, double* slopes);
 
 }  // namespace fhash

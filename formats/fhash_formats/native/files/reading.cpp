@@ -112,10 +112,19 @@ bool check_finite(const Frame& frame, fhash_error& error) {
     });
 }
 
-// The value of a frame at a vertex; NaN where there is none.
-template <class T> double value_at(const Frame& frame, size_t i) {
-    if (frame.values.empty() || !frame.mask[i]) return not_a_number<double>();
-    return real(reinterpret_cast<const T*>(frame.values.data())[i]);
+constexpr size_t BLOCK = 256;  // values between steps that are found together
+
+// Some values of a frame from vertex `start` on; NaN where it has none. `masked`: its mask counts.
+void take_values(const Frame& frame, size_t start, size_t count, bool masked, double* out) {
+    std::fill_n(out, count, not_a_number<double>());
+    if (frame.values.empty()) return;
+    with_type(frame.type, [&](auto type) {
+        const auto* const values =
+            reinterpret_cast<const decltype(type)*>(frame.values.data()) + start;
+        for (size_t i = 0; i < count; i++)
+            if (!masked || frame.mask[start + i]) out[i] = real(values[i]);
+        return true;
+    });
 }
 
 // The values of one frame, or between two, in a type of floats.
@@ -123,25 +132,26 @@ template <class F>
 void to_floats(const Call& call, const Frames& frames, bool clipped, std::vector<F>& out) {
     const F low = F(call.variable.within[0]), high = F(call.variable.within[1]);
     out.resize(frames.first.mask.size());
-    with_type(frames.first.type, [&](auto type) {
-        using T = decltype(type);
-        const T* const one = reinterpret_cast<const T*>(frames.first.values.data());
-        const T* const two = reinterpret_cast<const T*>(frames.second.values.data());
-        for (size_t i = 0; i < out.size(); i++) {
-            F value;
-            double slope;
-            if constexpr (std::is_same<T, Half>::value) value = F(real(one[i]));
-            else value = F(one[i]);
-            if (frames.share > 0)
-                value = F(value_between(frames.share, frames.beside, value_at<T>(frames.before, i),
-                                        real(one[i]), real(two[i]), value_at<T>(frames.behind, i),
-                                        slope));
+    double held[4][BLOCK], between[BLOCK];
+    const double* const each[4] = {held[0], held[1], held[2], held[3]};
+    for (size_t start = 0; start < out.size(); start += BLOCK) {
+        const size_t count = std::min(BLOCK, out.size() - start);
+        take_values(frames.first, start, count, false, held[1]);
+        if (frames.share > 0) {
+            take_values(frames.before, start, count, true, held[0]);
+            take_values(frames.second, start, count, false, held[2]);
+            take_values(frames.behind, start, count, true, held[3]);
+            values_between(each, frames.beside, int64_t(count), &frames.share, true, between,
+                           nullptr);
+        }
+        for (size_t i = 0; i < count; i++) {
+            F value = F(frames.share > 0 ? between[i] : held[1][i]);
             if (clipped && value < low) value = low;
             if (clipped && value > high) value = high;
-            out[i] = frames.first.mask[i] ? value : std::numeric_limits<F>::quiet_NaN();
+            out[start + i] =
+                frames.first.mask[start + i] ? value : std::numeric_limits<F>::quiet_NaN();
         }
-        return true;
-    });
+    }
 }
 
 // Rows of the part within the box: where they begin in the result.
