@@ -27,8 +27,8 @@ FHASH_INLINE bool finite(double value) {
 
 // By how much the slope at a step is above that of the secant between the two steps, from `first`
 // to `second`. On the other side of the step the change is from `one` to `two`, `distance` long.
-FHASH_INLINE void bends_at(const Block& block, const double* one, const double* two,
-                           double distance, double* FHASH_RESTRICT out) {
+void bends_at(const Block& block, const double* one, const double* two, double distance,
+              double* FHASH_RESTRICT out) {
     const double *first = block.first, *second = block.second;
     const double own = 1 + 2 * distance, others = 2 + distance;
     for (int64_t i = 0; i < block.n; i++) {
@@ -39,10 +39,14 @@ FHASH_INLINE void bends_at(const Block& block, const double* one, const double* 
     }
 }
 
-FHASH_INLINE void work(const Block& block, const Beside& beside) {
+void work(const Block& block, const Beside& beside) {
     double left[BLOCK] = {}, right[BLOCK] = {};
-    if (block.before) bends_at(block, block.before, block.first, beside.before, left);
-    if (block.behind) bends_at(block, block.second, block.behind, beside.behind, right);
+    for (int side = 0; side < 2; side++) {
+        const double* const one = side ? block.second : block.before;
+        const double* const two = side ? block.behind : block.first;
+        const double distance = side ? beside.behind : beside.before;
+        if (one && two) bends_at(block, one, two, distance, side ? right : left);
+    }
     const double *first = block.first, *second = block.second, *shares = block.shares;
     double* const slopes = block.slopes;
     const int64_t sloped = slopes ? block.n : 0;
@@ -67,8 +71,6 @@ FHASH_INLINE void work(const Block& block, const Beside& beside) {
     }
 }
 
-FHASH_CLONES void work_on(const Block& block, const Beside& beside) { work(block, beside); }
-
 }  // namespace
 
 void values_between(const double* const* frames, const Beside& beside, int64_t n,
@@ -80,10 +82,9 @@ void values_between(const double* const* frames, const Beside& beside, int64_t n
     if (alone) std::fill_n(own, BLOCK, *shares);
     for (int64_t start = 0; start < n; start += BLOCK) {
         const int64_t size = std::min(BLOCK, n - start);
-        work_on({held[0] ? frames[0] + start : nullptr, frames[1] + start, frames[2] + start,
-                 held[1] ? frames[3] + start : nullptr, alone ? own : shares + start,
-                 values + start,
-                 slopes ? slopes + start : nullptr, size}, beside);
+        work({held[0] ? frames[0] + start : nullptr, frames[1] + start, frames[2] + start,
+              held[1] ? frames[3] + start : nullptr, alone ? own : shares + start,
+              values + start, slopes ? slopes + start : nullptr, size}, beside);
     }
 }
 
