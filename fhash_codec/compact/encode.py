@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy.typing as npt
 
-from fhash_codec.compact.between import choose_between
 from fhash_codec.compact.goal import (
     EXCHANGE,
     FINEST_PSNR,
@@ -35,6 +34,7 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import head_bytes
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
+from fhash_codec.compact.sample import choose_between
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,

@@ -447,7 +447,8 @@ class CompactModel:
         if not share:
             return self._frame(first, region)
         near = self._near(first, cubic=self._cubic)
-        frames = dict(zip(near, self._counted(near, region), strict=True))
+        held = dict(zip(near, self._counted(near, region), strict=True))
+        frames = [held.get(number) for number in range(first - 1, first + 3)]
         return self._between(first, frames, np.array([share]))[0]
 
     def _near(self, step: int, *, cubic: bool) -> range:
@@ -455,14 +456,14 @@ class CompactModel:
         return range(max(step - cubic, 0), min(step + 2 + cubic, self._array.shape[0]))
 
     def _between(
-        self, step: int, frames: Mapping[int, Any], shares: Double, *, slopes: bool = False
+        self, step: int, frames: Frames, shares: Double, *, slopes: bool = False
     ) -> tuple[Double, Double | None]:
-        """Return `values_between` of a step and the next, by frames of `_near`."""
-        four = [frames.get(number) for number in range(step - 1, step + 3)]
-        four[2] = four[1] if four[2] is None else four[2]  # a single step
-        beside = four[0] is not None or four[3] is not None
+        """Return `values_between` of a step and the next; a single step is its own next one."""
+        before, first, second, behind = frames
+        beside = before is not None or behind is not None
         distances = self._key_times.distances(step) if beside else (0.0, 0.0)
-        return values_between(four, distances, shares, slopes=slopes)
+        frames = [before, first, first if second is None else second, behind]
+        return values_between(frames, distances, shares, slopes=slopes)
 
     def _counted(self, steps: range, region: Box) -> npt.NDArray[Any]:
         """Return the values (t, z, y, x) of a region at some steps; raise what `read` raises.
@@ -569,8 +570,7 @@ class CompactModel:
                 chosen = group[start : start + BLOCK]
                 held = [frames.get(n) for n in range(step - 1, step + 3)]
                 corners, shares = _corners(held, [p[chosen] for p in space], around, lengths)
-                numbered = dict(zip(range(step - 1, step + 3), corners, strict=True))
-                values, rates = self._between(step, numbered, steps[chosen] - step, slopes=slopes)
+                values, rates = self._between(step, corners, steps[chosen] - step, slopes=slopes)
                 yield chosen, values, rates, shares
 
     def _frame(self, step: int, region: Box) -> npt.NDArray[Any]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from reference.between import value_between
+from reference import value_between
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, RegionError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.between import value_between
+from reference import value_between
 from scipy.interpolate import PchipInterpolator
 
 import fhash_codec
@@ -19,8 +19,8 @@ from fhash_codec import EncodeConfig
 from fhash_codec.appending.parts import Part, encode_part
 from fhash_codec.appending.series_plan import plan_parts
 from fhash_codec.compact import encode as compact
-from fhash_codec.compact.between import choose_between
 from fhash_codec.compact.model import values_between
+from fhash_codec.compact.sample import choose_between
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries, Coordinate

@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 import pytest
-from reference.between import value_between
+from reference import value_between
 from untrained_heads import some_head
 
 import fhash_codec
