@@ -584,10 +584,10 @@ def _rounded(value: float | None, digits: int) -> float | None:
 
 def rule_between(header: Mapping[str, Any]) -> dict[str, Any]:
     """The rule of values between steps, `rule`, and `gain_db`, None where it was not measured."""
-    model, unmeasured = header["model"], {"rule": LINEAR, "gain_db": None}
+    model = header["model"]
     if model["profile"] != COMPACT:
-        return unmeasured | {"rule": NETWORK}
-    return unmeasured | model.get(BETWEEN, {})
+        return {"rule": NETWORK, "gain_db": None}
+    return {"rule": LINEAR, "gain_db": None, **model.get(BETWEEN, {})}
 
 
 def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> FileInfo:
