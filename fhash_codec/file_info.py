@@ -106,7 +106,9 @@ class FileInfo(TypedDict):
     feature_bounding_box: Annotated[list[list[int]], "[first, end) along z, y and x"]
     coreset_fraction: Annotated[float, "share of the domain that is kept, 0 to 1"]
     key_frames: Annotated[list[int], "steps that were encoded"]
-    model: Annotated[dict[str, Any], "the model, see FORMAT.md, The model"]
+    model: Annotated[
+        dict[str, Any], "the model, see FORMAT.md, The model; `between` is always there"
+    ]
     config: Annotated[dict[str, Any], "every setting that the file was made with"]
     training: Annotated[dict[str, Any], "seconds, epochs, device and more"]
     history: Annotated[list[HistoryPoint], "course of the training"]

@@ -29,7 +29,10 @@ from fhash_formats.container import (
     read_metadata,
 )
 from fhash_formats.container.header import (
+    BETWEEN,
+    COMPACT,
     HISTORY,
+    LINEAR,
     LOWEST,
     MISSING_ARRAY,
     NOT_STORED,
@@ -69,6 +72,9 @@ def check_name(path: Path) -> None:
             f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz"
         )
 
+
+NETWORK = "network"
+"""Rule of values between steps in files of the published network, which gives them itself."""
 
 PACKED = "pack"
 """Command in the header's `encoder` of a file whose tiles come from a Zarr store."""
@@ -576,6 +582,14 @@ def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
+def rule_between(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The rule of values between steps, `rule`, and `gain_db`, None where it was not measured."""
+    model = header["model"]
+    if model["profile"] != COMPACT:
+        return {"rule": NETWORK, "gain_db": None}
+    return {"rule": LINEAR, "gain_db": None, **model.get(BETWEEN, {})}
+
+
 def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> FileInfo:
     """The header of a container, and what follows from it; see `Volume.info`."""
     header = container.header
@@ -588,10 +602,12 @@ def describe_file(container: Container, path: object, key_frames: Sequence[int])
         }
         for array in container.arrays.values()
     }
+    full = full_header(header, container.arrays)
     return cast(
         "FileInfo",
         {
-            **full_header(header, container.arrays),
+            **full,
+            "model": {**full["model"], BETWEEN: rule_between(header)},
             "path": str(path),
             "bytes": container.size,
             "overhead_bytes": container.overhead(),

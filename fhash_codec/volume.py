@@ -21,7 +21,7 @@ from fhash_codec.boxes import (
     slice_of,
 )
 from fhash_codec.compact.model import CompactModel
-from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
+from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic
 from fhash_codec.header import describe_file, read_missing
 from fhash_codec.measure.value_range import ValueRange, decoded_type
 from fhash_codec.progress import Progress, silent
@@ -248,9 +248,7 @@ class Volume(Card, ArrayLike):
     @cached_property
     def key_times(self) -> KeyTimes:
         """The map from steps and times to the model's time axis."""
-        stored = self.container.arrays.get("key_frames")
-        key_frames = tuple(range(self.shape[0]) if stored is None else map(int, stored.read()))
-        return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
+        return KeyTimes.of(self.container)
 
     @property
     def info(self) -> FileInfo:

@@ -241,7 +241,7 @@ class SeriesPlan:
             box=selection.extent.box,
             samples=selection.extent.samples,
             recipe=Recipe.of(plan),
-            header=plain_json(table_header(selection, table, config, None)),
+            header=plain_json(table_header(series, selection, table, config, None)),
         )
 
     def require(self, series: Series) -> None:

@@ -132,7 +132,7 @@ def plan_layers(
         coding=found.coding,
         dtype=found.blocks.source_dtype,
     )
-    header = table_header(selection, CodedTable(plan=found), promised, None)
+    header = table_header(series, selection, CodedTable(plan=found), promised, None)
     del header["quality"]
     header["model"] = {**header["model"], "gains": []}
     header["model"].pop("tiling", None)

@@ -34,6 +34,7 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import head_bytes, training_device
 from fhash_codec.compact.head_training import BATCH_VOXELS
 from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
+from fhash_codec.compact.sample import choose_between
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
@@ -622,7 +623,7 @@ def encode_compact(
         with stage("writing", "tiles"):
             parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
-        own = table_header(selection, table, config, seconds)
+        own = table_header(series, selection, table, config, seconds)
         own["required_features"] = ["transform"]
         header = complete(source | described | own, table.in_source)
         overhead = writer.size(header) - table.outcome.size
@@ -637,7 +638,11 @@ def encode_compact(
 
 
 def table_header(
-    selection: FeatureSelection, table: CodedTable, config: EncodeConfig, seconds: float | None
+    series: Series,
+    selection: FeatureSelection,
+    table: CodedTable,
+    config: EncodeConfig,
+    seconds: float | None,
 ) -> dict[str, Any]:
     """Return what a header says beside the source and its coordinates, without the quality.
 
@@ -646,6 +651,8 @@ def table_header(
     extent = selection.extent
     kept = table.plan.history if table.plan.settings.head is not None else []
     tiling = tiling_header(table)
+    with stage("between steps", "linear or cubic, on steps that are left out"):
+        between = choose_between(series, extent, selection.scanned.value_range)
     return {
         "encoder": {
             "version": version("fhash"),
@@ -656,7 +663,11 @@ def table_header(
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
-        "model": model_header(table, config) | ({} if tiling is None else {"tiling": tiling}),
+        "model": {
+            **model_header(table, config),
+            **({} if tiling is None else {"tiling": tiling}),
+            **between,
+        },
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": None if table.bulk is None else {"range": list(table.bulk.ends)}},

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import ctypes
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache, reduce
 from itertools import product
 from typing import Any
@@ -11,11 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import NEIGHBOURS, Box, Mlp, Table, ceil_halvings
+from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import read_occupancy
+from fhash_codec.header import read_missing, rule_between
 from fhash_codec.measure.value_range import decoded_type
 from fhash_formats.container import Container, StoredArray
-from fhash_formats.container.header import PLAIN_FEATURE, TABLE
+from fhash_formats.container.header import CUBIC, MISSING_ARRAY, PLAIN_FEATURE, TABLE
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.native import library
 from fhash_formats.support.threads import chunk_region, common_part
 from fhash_formats.support.values import Double
 from fhash_formats.transform.head import Layer, NeighbourHead
@@ -255,9 +259,9 @@ class PlainArray:
 BLOCK = 1 << 13
 """Points whose corners are gathered at a time: they take 1 MiB, which stays in the cache."""
 
-Cells = tuple[npt.NDArray[np.intp], Double, list[Double]]
-"""Numbers (n,) of points, the corners (2, 2, 2, 2, n) around each, by t, z, y and x, and the shares
-(n,) of the upper corners along each axis."""
+Cells = tuple[npt.NDArray[np.intp], Double, Double | None, list[Double]]
+"""Numbers (n,) of points, the corners (2, 2, 2, n) around each, by z, y and x, at its time, their
+derivatives by the step, and the shares (n,) of the upper corners along each axis."""
 
 
 def equal_places(*numbers: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.intp]]:
@@ -281,11 +285,11 @@ def _before(positions: Any, length: int) -> npt.NDArray[np.int64]:
 
 
 def _corners(
-    frames: list[npt.NDArray[Any]], space: list[Double], region: Box, lengths: list[int]
-) -> tuple[Double, list[Double]]:
-    """Return the corners (2, 2, 2, 2, points) around points, and their shares along z, y and x.
+    frames: list[npt.NDArray[Any] | None], space: list[Double], region: Box, lengths: list[int]
+) -> tuple[list[Double | None], list[Double]]:
+    """Return the corners (2, 2, 2, points) around points, and their shares along z, y and x.
 
-    frames: values (z, y, x) of a region of a box of these lengths at both steps around the points.
+    frames: values (z, y, x) of a region of a box of these lengths at some steps.
     """
     low = [_before(p, n) for p, n in zip(space, lengths, strict=True)]
     shares = [p - i for p, i in zip(space, low, strict=True)]
@@ -296,43 +300,86 @@ def _corners(
     )
     # On an axis of a single vertex that one is before and behind every point.
     ahead = [stride if n > 1 else 0 for n, stride in zip(lengths, strides, strict=True)]
-    corners = np.empty((2, 2, 2, 2, space[0].size))
+    corners = [None if frame is None else np.empty((2, 2, 2, space[0].size)) for frame in frames]
     for z, y, x in product((0, 1), repeat=3):
         places = first + (z * ahead[0] + y * ahead[1] + x * ahead[2])
-        for t, frame in enumerate(frames):
-            corners[t, z, y, x] = frame.reshape(-1)[places]
+        for into, frame in zip(corners, frames, strict=True):
+            if into is not None and frame is not None:
+                into[z, y, x] = frame.reshape(-1)[places]
     return corners, shares
 
 
 def _interpolated(corners: Double, shares: list[Double]) -> Double:
-    """Return the values (n,) between corners (2, 2, 2, 2, n)."""
+    """Return the values (n,) between corners (2, 2, 2, n)."""
     values = np.zeros(corners.shape[-1])
-    for corner in _weighed(corners, shares, range(4)).reshape(16, -1):
+    for corner in _weighed(corners, shares, range(3)).reshape(8, -1):
         values += corner
     return values
 
 
 def _slopes(corners: Double, shares: list[Double]) -> Double:
-    """Return the derivatives (n, 4) by t, z, y and x between corners (2, 2, 2, 2, n)."""
-    slopes = np.empty((corners.shape[-1], 4))
-    for axis in range(4):
-        weighed = _weighed(corners, shares, [other for other in range(4) if other != axis])
+    """Return the derivatives (n, 3) by z, y and x between corners (2, 2, 2, n)."""
+    slopes = np.empty((corners.shape[-1], 3))
+    for axis in range(3):
+        weighed = _weighed(corners, shares, [other for other in range(3) if other != axis])
         # One after the other: numpy would add up those of a single point in another order.
         low, high = (
-            reduce(np.add, np.take(weighed, side, axis=axis).reshape(8, -1)) for side in (0, 1)
+            reduce(np.add, np.take(weighed, side, axis=axis).reshape(4, -1)) for side in (0, 1)
         )
         slopes[:, axis] = high - low
     return slopes
 
 
 def _weighed(corners: Double, shares: list[Double], axes: Iterable[int]) -> Double:
-    """Return corners (2, 2, 2, 2, n) times their weights, which are those along some axes."""
+    """Return corners (2, 2, 2, n) times their weights, which are those along some axes."""
     weights = np.ones(1)
     for axis in axes:
         sides = np.stack([1 - shares[axis], shares[axis]])
-        weights = weights * np.expand_dims(sides, [other for other in range(4) if other != axis])
+        weights = weights * np.expand_dims(sides, [other for other in range(3) if other != axis])
     # A corner without weight counts for nothing, also where it is not finite.
     return np.where(weights == 0, 0.0, weights * corners)
+
+
+Frames = Sequence[npt.NDArray[Any] | None]
+"""Values of one shape at four neighbouring steps. The outer two may be None or have NaN."""
+
+
+def values_between(
+    frames: Frames, distances: tuple[float, float], shares: Double, *, slopes: bool = False
+) -> tuple[Double, Double | None]:
+    """Return values at shares of the way from the second frame to the third, and derivatives.
+
+    Without the outer frames they are linear (FORMAT.md, Between steps).
+
+    frames: arrays (..., n).
+    distances: see `KeyTimes.distances`.
+    shares: float64 (n,), or one for all values.
+    slopes: whether to return derivatives by the share; None is returned for them otherwise.
+    """
+    given = [None if each is None else each.reshape(-1) for each in frames]
+    shape = next(each.shape for each in frames if each is not None)
+    values, derived = np.empty(shape), np.empty(shape) if slopes else None
+    # Piece by piece, so that copies in float64 stay in the cache.
+    shares = np.ascontiguousarray(shares)
+    piece = shares.size if shares.size > 1 else BLOCK
+    for start in range(0, values.size, piece):
+        held = [None if each is None else _wide(each[start : start + piece]) for each in given]
+        code = library().fhash_between(
+            (ctypes.c_void_p * 4)(*(None if each is None else each.ctypes.data for each in held)),
+            (ctypes.c_double * 2)(*distances),
+            min(piece, values.size - start),
+            shares.ctypes.data,
+            shares.size == 1,
+            values.ctypes.data + 8 * start,
+            None if derived is None else derived.ctypes.data + 8 * start,
+        )
+        assert code == 0
+    return values, derived
+
+
+def _wide(values: npt.NDArray[Any]) -> Double:
+    """Return values in float64, side by side."""
+    return np.ascontiguousarray(values, np.float64)
 
 
 class CompactModel:
@@ -350,6 +397,12 @@ class CompactModel:
             self._plain = PlainArray(container.header["model"], self._arrays)
         self._array = self._plain or self._table
         self.chunks = self._array.chunk_shape
+        self._cubic = rule_between(container.header)["rule"] == CUBIC
+
+    @cached_property
+    def _key_times(self) -> KeyTimes:
+        """The times of the key frames."""
+        return KeyTimes.of(self._container)
 
     @cached_property
     def tables(self) -> list[Table]:
@@ -385,18 +438,51 @@ class CompactModel:
     def read(self, step: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         """Return the values (z, y, x) of a region of the box at a step.
 
-        At a stored step they have the type of the source; between steps they are interpolated
-        linearly, in float64. Raises DamagedFileError for infinities, which no table holds.
+        At a stored step they have the type of the source; between steps they are interpolated by
+        the rule of the file, in float64. Raises DamagedFileError for infinities, which no table
+        holds.
         """
         first = int(np.floor(step))
-        weight = step - first
-        space = tuple(slice(low, high) for low, high in region)
-        stored = self._array.read((slice(first, first + (2 if weight else 1)), *space))
-        steps = self._without_infinities(stored)
-        values: npt.NDArray[Any] = steps[0]
-        if weight:
-            values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
-        return values
+        share = step - first
+        if not share:
+            return self._frame(first, region)
+        near = self._near(first, cubic=self._cubic)
+        held = dict(zip(near, self._counted(near, region), strict=True))
+        frames = [held.get(number) for number in range(first - 1, first + 3)]
+        return self._between(first, frames, np.array([share]))[0]
+
+    def _near(self, step: int, *, cubic: bool) -> range:
+        """Return the steps by which values between a step and the next are found."""
+        return range(max(step - cubic, 0), min(step + 2 + cubic, self._array.shape[0]))
+
+    def _between(
+        self, step: int, frames: Frames, shares: Double, *, slopes: bool = False
+    ) -> tuple[Double, Double | None]:
+        """Return `values_between` of a step and the next; a single step is its own next one."""
+        before, first, second, behind = frames
+        beside = before is not None or behind is not None
+        distances = self._key_times.distances(step) if beside else (0.0, 0.0)
+        frames = [before, first, first if second is None else second, behind]
+        return values_between(frames, distances, shares, slopes=slopes)
+
+    def _counted(self, steps: range, region: Box) -> npt.NDArray[Any]:
+        """Return the values (t, z, y, x) of a region at some steps; raise what `read` raises.
+
+        Where a cubic would count a value outside the coreset, it is NaN.
+        """
+        stored = self._array.read((slice(steps.start, steps.stop), *region.slices()))
+        values = self._without_infinities(stored)
+        if not self._cubic:
+            return values
+        counted = self._occupied_at(steps.start, steps.stop, region)
+        if MISSING_ARRAY in self._container.arrays:
+            first = Box.of(self._container.header["feature_bounding_box"]).first
+            for number, key in enumerate(steps):
+                step = self._key_times.key_frames[key]
+                missing = read_missing(self._container, range(step, step + 1), region.shift(first))
+                assert missing is not None
+                counted[number] &= ~missing[0]
+        return values if counted.all() else np.where(counted, values, np.nan)
 
     def read_steps(
         self, first: int, end: int, region: Box
@@ -443,7 +529,7 @@ class CompactModel:
         steps, space: steps and (z, y, x) of the points, in vertices of the box, all inside.
         """
         values = np.empty(steps.size)
-        for chosen, corners, shares in self._cells(steps, space):
+        for chosen, corners, _, shares in self._cells(steps, space, slopes=False):
             values[chosen] = _interpolated(corners, shares)
         return values
 
@@ -453,15 +539,17 @@ class CompactModel:
         On the border of two cells the derivatives are those of the cell after it.
         """
         values, slopes = np.empty(steps.size), np.empty((steps.size, 4))
-        for chosen, corners, shares in self._cells(steps, space):
+        for chosen, corners, rates, shares in self._cells(steps, space, slopes=True):
+            assert rates is not None
             values[chosen] = _interpolated(corners, shares)
-            slopes[chosen] = _slopes(corners, shares)
+            slopes[chosen, 0] = _interpolated(rates, shares)
+            slopes[chosen, 1:] = _slopes(corners, shares)
         return values, slopes
 
-    def _cells(self, steps: Double, space: list[Double]) -> Iterator[Cells]:
+    def _cells(self, steps: Double, space: list[Double], *, slopes: bool) -> Iterator[Cells]:
         """Yield points between the same two steps, and the cells around them, by ascending steps.
 
-        Each step is read once, the part of it that surrounds all points, and two are held.
+        Each step is read once, the part of it that surrounds all points, and few are held.
         """
         count, *lengths = self._array.shape
         around = Box.of(
@@ -471,16 +559,19 @@ class CompactModel:
         before, frames = _before(steps, count), dict[int, npt.NDArray[Any]]()
         for group in equal_places(before):
             step = int(before[group[0]])
-            pair = (step, min(step + 1, count - 1))
-            frames = {n: frames[n] for n in pair if n in frames}
-            for n in pair:
+            # At stored steps the values of others do not matter, but for the derivative.
+            cubic = self._cubic and (slopes or bool((steps[group] % 1).any()))
+            near = self._near(step, cubic=cubic)
+            frames = {n: frames[n] for n in near if n in frames}
+            for n in near:
                 if n not in frames:
-                    frames[n] = self._frame(n, around)
+                    frames[n] = self._counted(range(n, n + 1), around)[0]
             for start in range(0, group.size, BLOCK):
                 chosen = group[start : start + BLOCK]
-                places = [p[chosen] for p in space]
-                corners, shares = _corners([frames[n] for n in pair], places, around, lengths)
-                yield chosen, corners, [steps[chosen] - step, *shares]
+                held = [frames.get(n) for n in range(step - 1, step + 3)]
+                corners, shares = _corners(held, [p[chosen] for p in space], around, lengths)
+                values, rates = self._between(step, corners, steps[chosen] - step, slopes=slopes)
+                yield chosen, values, rates, shares
 
     def _frame(self, step: int, region: Box) -> npt.NDArray[Any]:
         """Return the values (z, y, x) of a region at a step; raise what `read` raises."""

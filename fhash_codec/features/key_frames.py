@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,9 @@ from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Series
 from fhash_formats.support.values import Longs, integer_origin, is_wide_integer
 from fhash_formats.transform.values import about_origin
+
+if TYPE_CHECKING:
+    from fhash_formats.container import Container
 
 FORMS = "all, every:K, auto:N or a list such as 0,4,9"
 """Forms of the setting `key_frames`, for error messages."""
@@ -63,6 +66,16 @@ class KeyTimes:
                 "use step numbers in their place"
             )
 
+    @classmethod
+    def of(cls, container: Container) -> KeyTimes:
+        """The map of a file."""
+        stored = container.arrays.get("key_frames")
+        steps = range(container.header["domain"]["shape"][0])
+        times = time_axis(container.coordinate("time").values)
+        return cls(
+            times=times, key_frames=tuple(map(int, steps if stored is None else stored.read()))
+        )
+
     def key_index(self, step: float) -> float:
         """The fractional key index of a fractional step, in [0, key frames - 1].
 
@@ -100,12 +113,27 @@ class KeyTimes:
         after = np.minimum(before + 1, last)
         return self.key_indices(after) - self.key_indices(before)
 
+    def distances(self, key: int) -> tuple[float, float]:
+        """Distances in time from the key frame before `key` to it, and behind the one that follows.
+
+        They are counted in the distance of these two, and 0 where there is no such key frame.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):  # scaling may make two times equal
+            gaps = np.diff(self._scaled_keys[max(key - 1, 0) : key + 3])
+            shares = gaps / gaps[min(key, 1)]
+        before = float(shares[0]) if key else 0.0
+        return before, float(shares[-1]) if key + 2 < len(self.key_frames) else 0.0
+
+    @cached_property
+    def _scaled_keys(self) -> npt.NDArray[np.float64]:
+        """The times of the key frames, ascending and near 1."""
+        return (self._ascending() * self._scale)[list(self.key_frames)]
+
     @cached_property
     def _key_indices_of_steps(self) -> npt.NDArray[np.float64]:
         """The key index of every step (T,)."""
-        ascending = self._ascending() * self._scale
-        keys = ascending[list(self.key_frames)]
-        indices = np.interp(ascending, keys, np.arange(keys.size))
+        keys = self._scaled_keys
+        indices = np.interp(self._ascending() * self._scale, keys, np.arange(keys.size))
         # Scaling may make two times equal; their steps still differ.
         indices[list(self.key_frames)] = np.arange(keys.size)
         return np.asarray(indices)

@@ -64,7 +64,7 @@ def key_times(run: Run) -> Iterator[Finding]:
 
 def between(run: Run) -> Iterator[Finding]:
     """Values between two steps are finite in the coreset; without the published network they are
-    interpolated linearly."""
+    interpolated by the rule of the file."""
     last = run.volume.shape[0] - 1
     if last == 0:
         return
@@ -76,17 +76,43 @@ def between(run: Run) -> Iterator[Finding]:
             read = run.volume.read(before + weight)
             lost += int(np.count_nonzero(np.isnan(read) == run.volume.occupancy(before + weight)))
             if run.volume.profile == "compact":
-                before_frame, after_frame, read = (
-                    frame.astype(np.float64) / scale
-                    for frame in (run.decoded[before], run.decoded[after], read)
+                near = slice(max(before - 1, 0), after + 2)
+                frames = run.decoded[near].astype(np.float64) / scale
+                off = np.abs(
+                    read.astype(np.float64) / scale - _between(run, frames, before, weight)
                 )
-                off = np.abs(read - (before_frame * (1 - weight) + after_frame * weight))
                 worst = max(worst, float(np.nanmax(off, initial=0.0)))
     yield Finding("finite between steps", lost, 0.0, "values")
     if run.volume.profile == "compact":
         kind = np.finfo(run.decoded.dtype)
         limit = 4 * float(kind.eps) + float(kind.smallest_subnormal) / scale
         yield Finding("even between steps", worst, limit, "of the largest value")
+
+
+def _between(run: Run, frames: Values, before: int, weight: float) -> Values:
+    """Values at a share of the way from a step to the next, by frames of these and those beside.
+
+    See FORMAT.md, Between steps.
+    """
+    first, second = frames[min(before, 1) :][:2]
+    even: Values = first * (1 - weight) + second * weight
+    if run.volume.info["model"]["between"]["rule"] == "linear":
+        return even
+    rise, bends = second - first, []
+    distances = run.volume.key_times.distances(before)
+    beside = (first - frames[0], distances[0]), (frames[-1] - second, distances[1])
+    for other, distance in beside:
+        if distance == 0:
+            bends.append(np.zeros_like(rise))
+            continue
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            mean = (3 + 3 * distance) / (
+                (2 + distance) / (other / distance) + (1 + 2 * distance) / rise
+            )
+        slope = np.where(np.sign(other) * np.sign(rise) > 0, mean, 0.0)
+        bends.append(np.where(np.isnan(other), 0.0, slope - rise))
+    bend = bends[0] * (1 - weight) - bends[1] * weight
+    return np.asarray(even + weight * (1 - weight) * bend)
 
 
 def points(run: Run) -> Iterator[Finding]:

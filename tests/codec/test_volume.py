@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from reference import value_between
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, RegionError
@@ -445,18 +446,19 @@ def points_in(shape: tuple[int, ...], count: int) -> list[np.ndarray]:
     return points
 
 
-def between(values: np.ndarray, point: list[float]) -> float:
+def between(values: np.ndarray, point: list[float], rule: str) -> float:
     """The value at a point between vertices (t, z, y, x); those without weight do not matter."""
-    low = [min(floor(p), max(n - 2, 0)) for p, n in zip(point, values.shape, strict=True)]
+    step, *space = point
+    low = [min(floor(p), max(n - 2, 0)) for p, n in zip(space, values.shape[1:], strict=True)]
     total = 0.0
-    for corner in product((0, 1), repeat=4):
+    for corner in product((0, 1), repeat=3):
         weight = 1.0
-        for p, i, up in zip(point, low, corner, strict=True):
+        for p, i, up in zip(space, low, corner, strict=True):
             weight *= p - i if up else 1 - (p - i)
         if weight:
-            total += weight * float(
-                values[tuple(i + up for i, up in zip(low, corner, strict=True))]
-            )
+            z, y, x = (i + up for i, up in zip(low, corner, strict=True))
+            alone = values[:, z, y, x].tolist()
+            total += weight * value_between(alone, range(len(alone)), step, rule)
     return total
 
 
@@ -479,10 +481,11 @@ def test_points_have_the_bits_of_a_sum_over_the_vertices_around_them(
         found = volume.sample(t=t, z=z, y=y, x=x)
         with_slopes, slopes = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
         low, high = map(volume.float_dtype.type, volume.value_range.floats)
+        rule = volume.info["model"].get("between", {}).get("rule", "linear")
     expected = np.full(t.size, np.nan, found.dtype)
     for number, (step, *place) in enumerate(zip(t, z, y, x, strict=True)):
         if all(0 <= p <= n - 1 for p, n in zip(place, values.shape[1:], strict=True)):
-            expected[number] = between(values, [step, *place])
+            expected[number] = between(values, [step, *place], rule)
     assert_array_equal(found, np.clip(expected, low, high))
     assert_array_equal(with_slopes, found)
     assert 300 < np.isfinite(found).sum() <= 700 - 10

@@ -18,10 +18,11 @@ import pytest
 from reference import rounding
 
 import fhash_codec
-from fhash_codec import EncodeConfig, Volume, encoding
+from fhash_codec import DamagedFileError, EncodeConfig, Volume, encoding
 from fhash_codec.compact import encode as compact
 from fhash_formats import native
 from fhash_formats.container import Container
+from fhash_formats.container import header as container_header
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.head import Layer, NeighbourHead
 
@@ -442,3 +443,16 @@ def test_integers_have_the_fill_value_where_they_have_no_value(tmp_path: Path) -
         assert volume.fill is not None
         found = file.read(1, volume.shape[1:], dtype="int16")
         assert_same(found, volume.values(1), None)
+
+
+def test_an_unknown_rule_is_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, values = tmp_path / "a.fhz", np.random.default_rng(9).normal(size=(3, 4, 5, 6))
+    with monkeypatch.context() as patch:
+        patch.setattr(compact, "choose_between", lambda *_: {"between": {"rule": "sinc"}})
+        patch.setattr(container_header, "CUBIC", "sinc")
+        fhash_codec.encode(values, path, EncodeConfig(max_error=0.1, effort=1))
+    with pytest.raises(DamagedFileError, match=r"model[.]between[.]rule is 'sinc'; needed: linear"):
+        fhash_codec.open(path)
+    with pytest.raises(Refused, match="linear or cubic") as refused:
+        Opened(path)
+    assert refused.value.args[0] == DAMAGED

@@ -127,10 +127,14 @@ GOLDENS = {
         max_error=0.02, effort=1, timings=False, features=("interval:0.5:2",)
     ),
     "compact-origin": EncodeConfig(max_error=3.0, effort=2, timings=False, tile="3x6x4x9"),
+    "compact-cubic": EncodeConfig(
+        max_error=1e-4, effort=1, timings=False, features=("interval:0.2:2",), dilation=0
+    ),
 }
 
 PLAIN = {
     "compact-plain-bound": "compact-bound",
+    "compact-plain-cubic": "compact-cubic",
     "compact-plain-head": "compact-head",
     "compact-plain-labels": "compact-labels",
     "paper-plain-coded": "paper-coded-occupancy",
@@ -273,6 +277,19 @@ def long_axis() -> ArraySeries:
     return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME, "x": x})
 
 
+def slow() -> ArraySeries:
+    """A smooth field of eight uneven times with a moving hole: best between steps by cubics."""
+    times = np.array([0.0, 0.5, 2.0, 2.25, 3.0, 4.5, 5.0, 6.25])
+    z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (6, 7, 9)), indexing="ij")
+    values = np.stack([np.sin(5 * x + 0.7 * time) * np.cos(4 * y) + z for time in times])
+    for step in range(8):
+        values[step, 2, 3, step % 4 : step % 4 + 2] = np.nan
+    time = Coordinate(name="time", values=times, attributes=TIME.attributes)
+    return ArraySeries(
+        values.astype(np.float32), name="density", units="kg m-3", coords={"t": time}
+    )
+
+
 def head() -> NeighbourHead:
     """A head of random weights that hardly changes a value, of one hidden layer."""
     chance = np.random.default_rng(3)
@@ -316,6 +333,7 @@ SERIES = {
     "compact-source": with_source,
     "compact-named": long_axis,
     "compact-origin": nanoseconds,
+    "compact-cubic": slow,
 }
 """Sources of the goldens that are not made from `series`."""
 

@@ -47,6 +47,8 @@ COMPACT = [
     "compact-axes",
     "compact-named",
     "compact-origin",
+    "compact-cubic",
+    "compact-plain-cubic",
 ]
 NAMES = [
     "paper-plain",

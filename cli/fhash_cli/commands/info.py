@@ -433,6 +433,7 @@ def _rows(volume: Volume, info: VolumeInfo) -> list[tuple[str, str]]:
         ),
         ("model", model_name(published=volume.profile == "paper")),
         *(_compact(volume, info) if volume.profile == "compact" else loss_rows(info["model"])),
+        ("between steps", between_text(info["model"]["between"])),
         ("training", _training(info)),
         *_predicted(info),
         *quality_rows(info["quality"], volume.units),
@@ -500,6 +501,15 @@ def _predicted(info: VolumeInfo) -> list[tuple[str, str]]:
     took = encoder.get("took_seconds")
     was = "" if took is None else f"; it took {number(took, 's', digits=3)}"
     return [("predicted", f"{', '.join(parts)}{was}, {size(info['bytes'])}")]
+
+
+def between_text(told: Mapping[str, Any]) -> str:
+    """The rule of values between steps, and what it gained where it was chosen."""
+    rule, gain = told["rule"], told["gain_db"]
+    if gain is None:
+        return str(rule)
+    other = "linear" if rule == "cubic" else "cubic"
+    return f"{rule} (measured: {abs(gain):.1f} dB better than {other} over left-out steps)"
 
 
 def tiling_text(info: VolumeInfo) -> str:

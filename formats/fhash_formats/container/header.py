@@ -297,6 +297,10 @@ TOGETHER = "together"
 """Attribute of this array, or key beside the lists: neighbouring steps of which each number is."""
 POSITIONS = ("time", "z", "y", "x")
 """Names of the coordinates in a container, in the order of the axes."""
+BETWEEN = "between"
+"""Key of `model` in the profile compact: the rule between steps, and what its choice gains."""
+LINEAR = "linear"
+CUBIC = "cubic"
 QUALITY = (
     "psnr",
     "rmse",
@@ -307,7 +311,7 @@ QUALITY = (
     "max_abs_error_domain",
 )
 """Figures in `quality`, each a number or null."""
-BETWEEN = (
+BETWEEN_QUALITY = (
     "psnr_key_frames",
     "psnr",
     "psnr_linear",
@@ -422,7 +426,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
         quality.number_or_null(key)
     _check_bulk(quality)
     if quality.has("between") and quality.get("between") is not None:
-        for key in BETWEEN:
+        for key in BETWEEN_QUALITY:
             quality.record("between").number_or_null(key)
     if quality.has("steps"):
         steps = quality.record("steps")
@@ -625,6 +629,10 @@ def _check_model(
         )
         if model.has("tiling"):
             _check_tiling(model.record("tiling"))
+        if model.has(BETWEEN):
+            between = model.record(BETWEEN)
+            between.choice("rule", (LINEAR, CUBIC))
+            between.number_or_null("gain_db")
     model.need(profile == COMPACT or not plain, "profile", f"{COMPACT} in a plain file")
     if plain:
         _check_plain(model)

@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 23
+ABI_VERSION = 24
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -77,6 +77,7 @@ PROTOTYPES: Prototypes = {
     "fhash_decode_block": (ARRAY, INTEGER, ARRAY, ARRAY),
     "fhash_head_apply": (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, ARRAY),
     "fhash_crc32c": (ARRAY, INTEGER, INTEGER, INTEGER),
+    "fhash_between": (ARRAY, ARRAY, INTEGER, ARRAY, INTEGER, ARRAY, ARRAY),
 }
 """Functions of this package's library that Python calls."""
 

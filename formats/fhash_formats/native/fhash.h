@@ -201,7 +201,7 @@ FHASH_API int32_t fhash_coordinate(fhash_file* file, int32_t number, int32_t axi
 
 /* Read a region at a step, or between two steps.
  *
- * step: 0 to shape[0] - 1; linear between steps.
+ * step: 0 to shape[0] - 1; between steps by the rule of the file, linear or monotone cubic (FORMAT.md).
  * region: z0, z1, y0, y1, x0, x1: half-open ranges of vertices; NULL for all.
  * lod: level of detail; n gives the vertices of the region whose indices are multiples of 2^n.
  * type: FHASH_FLOAT32, FHASH_FLOAT64, or the source's type at a whole step with lod 0.

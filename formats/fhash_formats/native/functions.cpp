@@ -5,15 +5,15 @@
 #include "core.hpp"
 
 #define FHASH_FUNCTIONS(FIND) \
-    FIND(abi_version) FIND(clip_f32) FIND(clip_f64) FIND(correct_f32_f32) FIND(correct_f32_f64) \
-    FIND(correct_f64_f32) FIND(correct_f64_f64) FIND(crc32c) FIND(decode) FIND(decode_block) \
-    FIND(decode_labels) FIND(decode_mask) FIND(decode_predicted) FIND(dequantise_f32) \
-    FIND(dequantise_f64) FIND(encode) FIND(encode_block) FIND(encode_labels) FIND(encode_mask) \
-    FIND(encode_predicted) FIND(fast_decode) FIND(fast_encode) FIND(free_f32) FIND(free_f64) \
-    FIND(head_apply) FIND(mask_levels_f32) FIND(mask_levels_f64) FIND(plan) FIND(quantise_f32) \
-    FIND(quantise_f64) FIND(reconstruct_f32) FIND(reconstruct_f64) FIND(residual_f32_f32) \
-    FIND(residual_f32_f64) FIND(residual_f64_f32) FIND(residual_f64_f64) FIND(tile_fill) \
-    FIND(tile_foretold) FIND(tile_forward) FIND(tile_part) FIND(tile_table) \
+    FIND(abi_version) FIND(between) FIND(clip_f32) FIND(clip_f64) FIND(correct_f32_f32) \
+    FIND(correct_f32_f64) FIND(correct_f64_f32) FIND(correct_f64_f64) FIND(crc32c) FIND(decode) \
+    FIND(decode_block) FIND(decode_labels) FIND(decode_mask) FIND(decode_predicted) \
+    FIND(dequantise_f32) FIND(dequantise_f64) FIND(encode) FIND(encode_block) FIND(encode_labels) \
+    FIND(encode_mask) FIND(encode_predicted) FIND(fast_decode) FIND(fast_encode) FIND(free_f32) \
+    FIND(free_f64) FIND(head_apply) FIND(mask_levels_f32) FIND(mask_levels_f64) FIND(plan) \
+    FIND(quantise_f32) FIND(quantise_f64) FIND(reconstruct_f32) FIND(reconstruct_f64) \
+    FIND(residual_f32_f32) FIND(residual_f32_f64) FIND(residual_f64_f32) FIND(residual_f64_f64) \
+    FIND(tile_fill) FIND(tile_foretold) FIND(tile_forward) FIND(tile_part) FIND(tile_table) \
     FIND(tile_uncorrected) FIND(transform_forward_f32) FIND(transform_forward_f64) \
     FIND(transform_inverse_f32) FIND(transform_inverse_f64) FIND(trellis_choose_f32) \
     FIND(trellis_choose_f64) FIND(trellis_count) FIND(trellis_guess_f32) FIND(trellis_guess_f64) \

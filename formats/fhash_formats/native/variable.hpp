@@ -21,6 +21,7 @@ struct Variable {
     double background = 0, max_error = 0, psnr = 0;
     Json fill = nullptr;  // a number, or null for none
     bool compact = false, plain = false;
+    bool cubic = false;  // monotone cubic between steps, of the profile compact
     int64_t features = 1;
     Record model;
     std::string tables;                          // model.tables

@@ -1,6 +1,7 @@
 // Values of a variable of an open file.
 #pragma once
 
+#include "between.hpp"
 #include "chunks.hpp"
 
 namespace fhash {
@@ -32,6 +33,10 @@ bool read_positions(fhash_file& file, const Variable& variable, int axis, double
 // The key index of a step: a whole number at each key frame.
 bool find_key(fhash_file& file, const Variable& variable, double step, double& key,
               fhash_error& error);
+
+// The key frames beside `key` and the next one: their distances, and their steps, -1 for none.
+bool find_beside(fhash_file& file, const Variable& variable, int64_t key, Beside& beside,
+                 int64_t* steps, fhash_error& error);
 
 // Values of the profile compact at a key frame.
 bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice& lattice,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
-from exports import exported
 
 import fhash_codec.native as codec_native
 import fhash_formats.native as formats_native
@@ -14,8 +14,25 @@ from fhash_codec.native import ABI_VERSION, PROTOTYPES, network
 from fhash_codec.native.network import (
     ABI_VERSION as ABI_VERSION_NETWORK,
 )
+from fhash_formats.native import ARRAY, INTEGER, REAL
 
 SOURCES = Path(codec_native.__file__).parent
+_KINDS = {"*": ARRAY, "int64_t": INTEGER, "double": REAL}
+_EXPORTED = re.compile(r"FHASH_EXPORT \S+ (fhash_\w+)\(([^)]*)\)")
+
+
+def exported(folder: Path) -> dict[str, tuple[type, ...]]:
+    """The functions of a folder's sources by name; not those that return an ABI number."""
+    return {
+        name: tuple(_kind(argument) for argument in arguments.split(",") if argument)
+        for path in folder.glob("*.cpp")
+        for name, arguments in _EXPORTED.findall(path.read_text(encoding="utf-8"))
+        if not name.endswith("_abi_version")
+    }
+
+
+def _kind(argument: str) -> type:
+    return _KINDS["*" if "*" in argument else argument.split()[0].removeprefix("std::")]
 
 
 def test_it_is_a_library_of_its_own() -> None:

@@ -60,20 +60,27 @@ bool set_lattice(Call& call, const int64_t* region, int lod, fhash_error& error)
     return all.size(3) <= SIZE_MAX / 16 || fail(error, FHASH_ERROR_MEMORY, "no memory");
 }
 
+// The steps that a value is of: one, or the two that it lies between and those beside them.
+struct Frames {
+    Frame first, second, before, behind;  // the last two without values where there are none
+    double share = 0;
+    Beside beside;
+};
+
 // Takes out of a mask the vertices that had no finite value at a step or one beside it.
-bool take_missing(const Call& call, Buffer& mask, fhash_error& error) {
+bool take_missing(const Call& call, double step, Buffer& mask, fhash_error& error) {
     const Array* const array = call.variable.find("missing/bits");
     if (!array) return true;
     const int64_t* const shape = call.variable.shape;
     const int64_t* const box = call.variable.box;
     const Lattice& common = call.common;
     Region row;
-    row.first[0] = int64_t(std::floor(call.step));
+    row.first[0] = int64_t(std::floor(step));
     row.last[0] = row.first[0] + 1;
     const int64_t layer = shape[2] * shape[3];
     row.first[1] = (box[0] + common.first[0]) * layer / 8;
     row.last[1] = ((box[0] + common.last(0)) * layer + 7) / 8;
-    for (; row.first[0] <= int64_t(std::ceil(call.step)); row.first[0]++, row.last[0]++) {
+    for (; row.first[0] <= int64_t(std::ceil(step)); row.first[0]++, row.last[0]++) {
         Buffer bits;
         if (!read_region(call.file, *array, row, bits, nullptr, error)) return false;
         size_t to = 0;
@@ -105,27 +112,46 @@ bool check_finite(const Frame& frame, fhash_error& error) {
     });
 }
 
-// The values of one frame, or between two, in a type of floats.
-template <class F>
-void to_floats(const Call& call, const Frame& first, const Frame& second, double weight,
-               bool clipped, std::vector<F>& out) {
-    const F low = F(call.variable.within[0]), high = F(call.variable.within[1]);
-    out.resize(first.mask.size());
-    with_type(first.type, [&](auto type) {
-        using T = decltype(type);
-        const T* const one = reinterpret_cast<const T*>(first.values.data());
-        const T* const two = reinterpret_cast<const T*>(second.values.data());
-        for (size_t i = 0; i < out.size(); i++) {
-            F value;
-            if constexpr (std::is_same<T, Half>::value) value = F(real(one[i]));
-            else value = F(one[i]);
-            if (weight > 0) value = F(real(one[i]) * (1 - weight) + real(two[i]) * weight);
-            if (clipped && value < low) value = low;
-            if (clipped && value > high) value = high;
-            out[i] = first.mask[i] ? value : std::numeric_limits<F>::quiet_NaN();
-        }
+constexpr size_t BLOCK = 256;  // values between steps that are found together
+
+// Some values of a frame from vertex `start` on; NaN where it has none. `masked`: its mask counts.
+void take_values(const Frame& frame, size_t start, size_t count, bool masked, double* out) {
+    std::fill_n(out, count, not_a_number<double>());
+    if (frame.values.empty()) return;
+    with_type(frame.type, [&](auto type) {
+        const auto* const values =
+            reinterpret_cast<const decltype(type)*>(frame.values.data()) + start;
+        for (size_t i = 0; i < count; i++)
+            if (!masked || frame.mask[start + i]) out[i] = real(values[i]);
         return true;
     });
+}
+
+// The values of one frame, or between two, in a type of floats.
+template <class F>
+void to_floats(const Call& call, const Frames& frames, bool clipped, std::vector<F>& out) {
+    const F low = F(call.variable.within[0]), high = F(call.variable.within[1]);
+    out.resize(frames.first.mask.size());
+    double held[4][BLOCK], between[BLOCK];
+    const double* const each[4] = {held[0], held[1], held[2], held[3]};
+    for (size_t start = 0; start < out.size(); start += BLOCK) {
+        const size_t count = std::min(BLOCK, out.size() - start);
+        take_values(frames.first, start, count, false, held[1]);
+        if (frames.share > 0) {
+            take_values(frames.before, start, count, true, held[0]);
+            take_values(frames.second, start, count, false, held[2]);
+            take_values(frames.behind, start, count, true, held[3]);
+            values_between(each, frames.beside, int64_t(count), &frames.share, true, between,
+                           nullptr);
+        }
+        for (size_t i = 0; i < count; i++) {
+            F value = F(frames.share > 0 ? between[i] : held[1][i]);
+            if (clipped && value < low) value = low;
+            if (clipped && value > high) value = high;
+            out[start + i] =
+                frames.first.mask[start + i] ? value : std::numeric_limits<F>::quiet_NaN();
+        }
+    }
 }
 
 // Rows of the part within the box: where they begin in the result.
@@ -157,11 +183,10 @@ void blank_floats(const Call& call) {
 }
 
 template <class F>
-bool give_floats(const Call& call, const Frame& first, const Frame& second, double weight,
-                 bool clipped, fhash_error& error) {
+bool give_floats(const Call& call, const Frames& frames, bool clipped, fhash_error& error) {
     if (!may_use(*call.file.context, sizeof(F) * uint64_t(call.common.size()), error)) return false;
     std::vector<F> values;
-    to_floats<F>(call, first, second, weight, clipped, values);
+    to_floats<F>(call, frames, clipped, values);
     if (call.type == FHASH_FLOAT16) put_floats<Half>(call, values);
     if (call.type == FHASH_FLOAT32) put_floats<float>(call, values);
     if (call.type == FHASH_FLOAT64) put_floats<double>(call, values);
@@ -241,6 +266,25 @@ bool read_paper(const Call& call, double key, Frame& frame, fhash_error& error) 
     return read_network(call.file, variable, key, call.common, frame.mask, values, error);
 }
 
+// The values at a key index of the profile compact, or those that it lies between.
+bool read_compact_at(const Call& call, double key, Frames& frames, fhash_error& error) {
+    const int64_t before = int64_t(std::floor(key));
+    frames.share = key - double(before);
+    if (!read_compact(call, before, frames.first, error)) return false;
+    if (frames.share == 0) return true;
+    if (!read_compact(call, before + 1, frames.second, error)) return false;
+    // A value is no better than the two that it lies between.
+    Buffer& mask = frames.first.mask;
+    for (size_t i = 0; i < mask.size(); i++) mask[i] &= frames.second.mask[i];
+    if (!call.variable.cubic) return true;
+    int64_t steps[2];
+    if (!find_beside(call.file, call.variable, before, frames.beside, steps, error)) return false;
+    return (steps[0] < 0 || (read_compact(call, before - 1, frames.before, error) &&
+                             take_missing(call, double(steps[0]), frames.before.mask, error))) &&
+           (steps[1] < 0 || (read_compact(call, before + 2, frames.behind, error) &&
+                             take_missing(call, double(steps[1]), frames.behind.mask, error)));
+}
+
 bool read_values(Call& call, fhash_error& error) {
     const Variable& variable = call.variable;
     if (!call.integers()) blank_floats(call);
@@ -248,25 +292,15 @@ bool read_values(Call& call, fhash_error& error) {
         return !call.integers() || give_integers(call, nullptr, error);
     double key = 0;
     if (!find_key(call.file, variable, call.step, key, error)) return false;
-    const double before = std::floor(key);
-    double weight = 0;
-    Frame first, second;
-    if (variable.compact) {
-        weight = key - before;
-        if (!read_compact(call, int64_t(before), first, error)) return false;
-        if (weight > 0) {
-            if (!read_compact(call, int64_t(before) + 1, second, error)) return false;
-            // A value is no better than the two that it lies between.
-            for (size_t i = 0; i < first.mask.size(); i++) first.mask[i] &= second.mask[i];
-        }
-    } else if (!read_paper(call, key, first, error)) {
+    Frames frames;
+    if (!(variable.compact ? read_compact_at(call, key, frames, error)
+                           : read_paper(call, key, frames.first, error)) ||
+        !take_missing(call, call.step, frames.first.mask, error))
         return false;
-    }
-    if (!take_missing(call, first.mask, error)) return false;
-    if (call.integers()) return give_integers(call, &first, error);
-    const bool clipped = key != before;
-    return variable.in_float32() ? give_floats<float>(call, first, second, weight, clipped, error)
-                                 : give_floats<double>(call, first, second, weight, clipped, error);
+    if (call.integers()) return give_integers(call, &frames.first, error);
+    const bool clipped = key != std::floor(key);
+    return variable.in_float32() ? give_floats<float>(call, frames, clipped, error)
+                                 : give_floats<double>(call, frames, clipped, error);
 }
 
 bool check_type(const Call& call, fhash_error& error) {

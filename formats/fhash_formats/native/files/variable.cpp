@@ -146,6 +146,19 @@ bool read_levels(Variable& variable, fhash_error& error) {
     return variable.model.need(good, "levels", "[t, z, y, x] of the box, and coarser ones", error);
 }
 
+// The rule between steps, linear unless the header has another.
+bool read_between(Variable& variable, fhash_error& error) {
+    Record between;
+    std::string rule;
+    double gain = 0;
+    if (!variable.model.find("between")) return true;
+    if (!variable.model.record("between", between, error) || !between.text("rule", rule, error) ||
+        !between.number_or_null("gain_db", gain, error))
+        return false;
+    variable.cubic = rule == "cubic";
+    return between.need(variable.cubic || rule == "linear", "rule", "linear or cubic", error);
+}
+
 // The part of `model` that reading needs.
 bool read_model(Variable& variable, fhash_error& error) {
     const Record& top = variable.header;
@@ -167,6 +180,7 @@ bool read_model(Variable& variable, fhash_error& error) {
         !read_levels(variable, error))
         return false;
     if (!variable.compact) return true;
+    if (!read_between(variable, error)) return false;
     std::string values = variable.tables;
     if (variable.plain && !model.text("values", values, error)) return false;
     variable.values = type_of_name(values.c_str());

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <numeric>
 
 #include "numbers.hpp"
 
@@ -62,6 +63,28 @@ bool read_key_frames(fhash_file& file, const Variable& variable, std::vector<int
                         "array key_frames does not increase within the steps");
     return true;
 }
+
+// The key frames and the times of a variable.
+struct KeyTimes {
+    std::vector<int64_t> keys;
+    std::vector<double> steps, at;  // times of all steps, and of the key frames; see order_times
+
+    bool read(fhash_file& file, const Variable& variable, fhash_error& error) {
+        const size_t count = size_t(variable.shape[0]);
+        if (!may_use(*file.context, uint64_t(count) * 24, error)) return false;
+        if (variable.keys() == variable.shape[0]) {
+            keys.resize(count);
+            std::iota(keys.begin(), keys.end(), 0);
+        } else if (!read_key_frames(file, variable, keys, error)) {
+            return false;
+        }
+        steps.resize(count);
+        if (!read_positions(file, variable, 0, steps.data(), error)) return false;
+        order_times(steps);
+        for (const int64_t frame : keys) at.push_back(steps[size_t(frame)]);
+        return true;
+    }
+};
 
 // Where a bit of the occupancy of a vertex is, for each position along an axis.
 std::vector<uint64_t> morton_part(const Variable& variable, int axis, const Lattice& lattice) {
@@ -221,23 +244,33 @@ bool find_key(fhash_file& file, const Variable& variable, double step, double& k
     const int64_t steps = variable.shape[0];
     key = step;
     if (variable.keys() == steps) return true;
-    std::vector<int64_t> keys;
-    std::vector<double> times, at;
-    if (!may_use(*file.context, uint64_t(steps) * 24, error) ||
-        !read_key_frames(file, variable, keys, error))
-        return false;
-    times.resize(size_t(steps));
-    if (!read_positions(file, variable, 0, times.data(), error)) return false;
-    order_times(times);
-    for (const int64_t frame : keys) at.push_back(times[size_t(frame)]);
+    KeyTimes times;
+    if (!times.read(file, variable, error)) return false;
     const auto index = [&](int64_t number) {
-        const auto known = std::lower_bound(keys.begin(), keys.end(), number);
-        if (known != keys.end() && *known == number) return double(known - keys.begin());
-        return interpolated(at, times[size_t(number)]);
+        const auto known = std::lower_bound(times.keys.begin(), times.keys.end(), number);
+        if (known != times.keys.end() && *known == number)
+            return double(known - times.keys.begin());
+        return interpolated(times.at, times.steps[size_t(number)]);
     };
     const int64_t before = int64_t(std::floor(step));
     const double low = index(before), high = index(std::min(before + 1, steps - 1));
-    key = std::clamp(low + (high - low) * (step - double(before)), 0.0, double(keys.size() - 1));
+    const double last = double(variable.keys() - 1);
+    key = std::clamp(low + (high - low) * (step - double(before)), 0.0, last);
+    return true;
+}
+
+bool find_beside(fhash_file& file, const Variable& variable, int64_t key, Beside& beside,
+                 int64_t* steps, fhash_error& error) {
+    KeyTimes times;
+    if (!times.read(file, variable, error)) return false;
+    const auto distance = [&](int64_t from) {
+        const bool there = from >= 0 && from + 1 < variable.keys();
+        return there ? times.at[size_t(from + 1)] - times.at[size_t(from)] : 0;
+    };
+    const double between = distance(key);
+    beside = {distance(key - 1) / between, distance(key + 1) / between};
+    steps[0] = key > 0 ? times.keys[size_t(key - 1)] : -1;
+    steps[1] = key + 2 < variable.keys() ? times.keys[size_t(key + 2)] : -1;
     return true;
 }
 
