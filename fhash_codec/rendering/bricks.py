@@ -121,28 +121,33 @@ class Bricks:
         values: float32 (z, y, x), contiguous, the values of the frame with NaN for infinite ones.
         low, high: float32 (z, y, x) of bricks, the smallest and the largest value; infinity and
             minus infinity where a brick has no value.
+        value_range: the smallest and the largest value, of the series where it is known: then it
+            depends neither on the step nor on what is decoded. (0, 0) where there is none.
     """
 
     values: Single
     low: Single
     high: Single
+    value_range: tuple[float, float]
     _kept: dict[str, OrderedDict[object, Any]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, frame: Frame) -> Bricks:
         """The bricks of a frame, found in a time that is short beside that of a picture."""
         values = np.ascontiguousarray(frame.values, dtype=np.float32)
-        low, high = _extremes(values)
+        low, high = extremes(values)
         if np.isneginf(low).any() or np.isposinf(high).any():
             values = np.where(np.isfinite(values), values, np.float32(np.nan))
-            low, high = _extremes(values)
-        return cls(values=values, low=low, high=high)
+            low, high = extremes(values)
+        least, most = float(low.min()), float(high.max())
+        ends = (least, most) if least <= most else (0.0, 0.0)
+        return cls(values=values, low=low, high=high, value_range=ends)
 
-    @property
-    def value_range(self) -> tuple[float, float]:
-        """The smallest and the largest value; (0, 0) where there is none."""
-        low, high = float(self.low.min()), float(self.high.max())
-        return (low, high) if low <= high else (0.0, 0.0)
+    @classmethod
+    def unknown(cls, values: Single) -> Bricks:
+        """The bricks of values that are still to come: without a value."""
+        low = np.full(_counts(values), np.inf, dtype=np.float32)
+        return cls(values=values, low=low, high=-low, value_range=(0.0, 0.0))
 
     def remembered(
         self, kind: str, key: object, compute: Callable[[], Result], most: int = CACHED
@@ -199,22 +204,21 @@ class Bricks:
             matters = self.matters(task)
             distance = np.where(matters, 0, FARTHEST).astype(np.int32)
             if matters.any():
-                library, (layers, rows, _), size = (
-                    native.library(),
-                    distance.shape,
-                    self.values.size,
-                )
-                _find_distances(library.fhash_march_distance_layers, distance, layers, size)
-                _find_distances(library.fhash_march_distance_rows, distance, rows, size)
+                nearest(distance)
             distance.flags.writeable = False
             return distance
 
         return self.remembered("distance", task.visibility, compute)
 
 
-def _extremes(values: Single) -> tuple[Single, Single]:
+def _counts(values: Single) -> list[int]:
+    """Numbers of bricks along z, y and x."""
+    return [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
+
+
+def extremes(values: Single) -> tuple[Single, Single]:
     """The smallest and the largest value of each brick, as the attributes of `Bricks` have them."""
-    bricks = [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
+    bricks = _counts(values)
     low, high = np.empty(bricks, dtype=np.float32), np.empty(bricks, dtype=np.float32)
     library = native.library()
     shape, counts = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*bricks)
@@ -237,17 +241,33 @@ def _extremes(values: Single) -> tuple[Single, Single]:
     return low, high
 
 
-def _find_distances(
-    function: Callable[..., object], distance: npt.NDArray[np.int32], count: int, vertices: int
-) -> None:
-    """Call one of the functions of march_bricks.cpp for distances with numbers 0 .. count - 1."""
-    shape = (ctypes.c_int64 * 3)(*distance.shape)
+def nearest(distance: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Put the distance from the nearest brick of 0 in place of larger numbers (z, y, x)."""
+    shape, library = (ctypes.c_int64 * 3)(*distance.shape), native.library()
+    layers, rows = library.fhash_march_distance_layers, library.fhash_march_distance_rows
+    for count, function in zip(distance.shape, (layers, rows), strict=False):
 
-    def find(number: int) -> None:
-        scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
-        function(shape, distance.ctypes.data, number, number + 1, scratch.ctypes.data)
+        def find(number: int, function: Callable[..., object] = function) -> None:
+            scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
+            function(shape, distance.ctypes.data, number, number + 1, scratch.ctypes.data)
 
-    _in_turn(find, range(count), vertices)
+        _in_turn(find, range(count), distance.size * SIDE**3)
+    return distance
+
+
+def reduced(
+    values: npt.NDArray[Any],
+    begin: npt.NDArray[np.int64],
+    end: npt.NDArray[np.int64],
+    axis: int,
+    reduce: np.ufunc,
+) -> npt.NDArray[Any]:
+    """Reduce the spans `begin` to `end`, both included, of an axis."""
+    moved = np.moveaxis(values, axis, 0)
+    parts = [
+        reduce.reduce(moved[low : high + 1], axis=0) for low, high in zip(begin, end, strict=True)
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.stack(parts), 0, axis))
 
 
 def _in_turn(function: Callable[[int], object], numbers: range, vertices: int) -> None:
@@ -308,9 +328,14 @@ def smoothed(values: Single, deviation: float, error: float = math.inf) -> Singl
     return out
 
 
+def reach_of(deviation: float) -> int:
+    """Vertices that a Gaussian reaches on both sides."""
+    return math.ceil(REACH * deviation)
+
+
 def _weights(deviation: float) -> Single:
     """Weights of a value itself and of those 1, 2 and so on vertices away on both sides."""
-    away = np.arange(math.ceil(REACH * deviation) + 1)
+    away = np.arange(reach_of(deviation) + 1)
     weights = np.exp(-0.5 * (away / deviation) ** 2)
     return np.asarray(weights / (2 * weights.sum() - weights[0]), dtype=np.float32)
 

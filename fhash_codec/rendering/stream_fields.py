@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fhash_codec.paper.model import PaperModel, PointSampler, PointTables
 from fhash_codec.paper.network import Network
-from fhash_codec.rendering.bricks import SIDE, Bricks, Palette
+from fhash_codec.rendering.bricks import SIDE, Bricks, Palette, reduced
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Warp
 from fhash_codec.rendering.march_task import (
@@ -119,6 +119,11 @@ class Field(Protocol):
         """The place (3,), x, y, z, at which the first brick and the first cell begin."""
         ...
 
+    @property
+    def stride(self) -> int:
+        """Vertices of the domain along the side of a cell."""
+        ...
+
     def visible(self, palette: Palette) -> Array:
         """Cells (z, y, x), the first at `first`, in which a sample could have an opacity.
 
@@ -138,6 +143,13 @@ class Field(Protocol):
         """Derivatives by x, y and z per vertex, float64 (n, 3), 0 where there are none."""
         ...
 
+    def smoothed(self, deviation: float, error: float) -> Field | None:
+        """The field that shades where the noise of coding is smoothed; None where nothing is.
+
+        deviation: of a Gaussian, in vertices. error: largest difference of a smoothed value.
+        """
+        ...
+
 
 def central_slopes(field: Field, places: Array) -> Array:
     """Slopes (n, 3) at places (n, 3) by central differences.
@@ -146,16 +158,17 @@ def central_slopes(field: Field, places: Array) -> Array:
     one of the two has no value, the field's own slope along that axis stands.
     """
     arrays, xp, (low, high) = field.arrays, field.arrays.xp, field.vertices.T
+    away = float(field.stride)
     slopes = arrays.empty((len(places), 3))
     for axis in range(3):
         ends = []
-        for offset in (-1.0, 1.0):
+        for offset in (-away, away):
             moved = arrays.copy(places)
             moved[:, axis] = xp.clip(
                 xp.clip(places[:, axis], low[axis], high[axis]) + offset, low[axis], high[axis]
             )
             ends.append(field.values(moved))
-        slopes[:, axis] = (ends[1] - ends[0]) / 2
+        slopes[:, axis] = (ends[1] - ends[0]) / (2 * away)
     (missing,) = arrays.nonzero(xp.any(xp.isnan(slopes), axis=1))
     if len(missing):
         slopes[missing] = xp.where(
@@ -170,6 +183,8 @@ class CoresetField:
     A place has a value where all vertices of weight around it are in the coreset. Which one is not
     known before the field is evaluated: any value of the range, with a margin.
     """
+
+    stride = 1
 
     def __init__(
         self,
@@ -203,7 +218,10 @@ class CoresetField:
 
     def visible(self, palette: Palette) -> Array:
         """Cells with a vertex of the coreset: their values are not known before evaluation."""
-        return _of_cells(self._in_coreset, self.arrays.xp.logical_or)
+        return of_cells(self._in_coreset, self.arrays.xp.logical_or)
+
+    def smoothed(self, deviation: float, error: float) -> None:
+        """Nothing: networks are smooth."""
 
     def inside(self, places: Array) -> tuple[Array, Array]:
         """Places (n, 3) in vertices of the box, clipped to it, and whether they have a value."""
@@ -286,14 +304,16 @@ def _possible(in_coreset: npt.NDArray[np.bool_], low: float, high: float) -> Bri
         Frame(values=np.where(in_coreset, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
     )
     has_value = bricks.low <= bricks.high
+    low, high = (float(np.float32(end)) for end in (2 * low - high, 2 * high - low))
     return replace(
         bricks,
-        low=np.where(has_value, np.float32(2 * low - high), np.float32(np.inf)),
-        high=np.where(has_value, np.float32(2 * high - low), np.float32(-np.inf)),
+        low=np.where(has_value, np.float32(low), np.float32(np.inf)),
+        high=np.where(has_value, np.float32(high), np.float32(-np.inf)),
+        value_range=(low, high) if has_value.any() else (0.0, 0.0),
     )
 
 
-def _of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
+def of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
     """Reduce the eight vertices of each cell (z, y, x) by a function of two arrays.
 
     An axis of one vertex has one cell.
@@ -310,6 +330,8 @@ class WarpedField:
 
     Between two drawn vertices places run linearly. Bricks and cells take in all that they touch.
     """
+
+    stride = 1
 
     def __init__(self, field: Field, warp: Warp) -> None:
         """Stand between a marcher and a field."""
@@ -334,8 +356,8 @@ class WarpedField:
         # Bricks of drawn cells have the extreme values of all bricks that they touch.
         for axis, number in ((0, 2), (1, 1), (2, 0)):
             begin, end = self._touched(number, SIDE, low.shape[axis], float(first[number]))
-            low = _extremes(low, begin, end, axis, np.minimum)
-            high = _extremes(high, begin, end, axis, np.maximum)
+            low = reduced(low, begin, end, axis, np.minimum)
+            high = reduced(high, begin, end, axis, np.maximum)
         self.bricks = replace(field.bricks, low=low, high=high)
 
     def _drawn(self, places: Array) -> Array:
@@ -374,7 +396,7 @@ class WarpedField:
         first = self.arrays.host(self._field.first)
         for axis, number in ((0, 2), (1, 1), (2, 0)):
             begin, end = self._touched(number, 1, seen.shape[axis], float(first[number]))
-            seen = _extremes(seen, begin, end, axis, np.logical_or)
+            seen = reduced(seen, begin, end, axis, np.logical_or)
         return self.arrays.array(seen)
 
     def values(self, places: Array, wanted: Array | None = None) -> Array:
@@ -385,6 +407,10 @@ class WarpedField:
         """Derivatives (n, 3) by x, y and z per drawn vertex, 0 where there are none."""
         moved, rates = self._moved(places)
         return self._field.slopes(moved) * rates
+
+    def smoothed(self, deviation: float, error: float) -> Field | None:
+        """Nothing: networks, which alone are warped here, are smooth."""
+        return None
 
     def _moved(self, places: Array) -> tuple[Array, Array]:
         """Places (n, 3) in vertices of the series, and vertices of it per drawn vertex (n, 3)."""
@@ -400,17 +426,6 @@ class WarpedField:
             moved[:, axis] = low + (at - arrays.to_float64(before)) * rate
             rates[:, axis] = rate
         return moved, rates
-
-
-def _extremes(
-    values: np.ndarray, begin: np.ndarray, end: np.ndarray, axis: int, reduce: np.ufunc
-) -> np.ndarray:
-    """Reduce the spans `begin` to `end`, both included, of an axis."""
-    moved = np.moveaxis(values, axis, 0)
-    parts = [
-        reduce.reduce(moved[low : high + 1], axis=0) for low, high in zip(begin, end, strict=True)
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.stack(parts), 0, axis))
 
 
 ENDLESS = 2.0**62
@@ -649,19 +664,19 @@ class Leaping:
     side: float
 
     @classmethod
-    def of(cls, bricks: Bricks, task: Task, first: Array, arrays: Arrays) -> Leaping:
+    def of(cls, field: Field, task: Task) -> Leaping:
         """Leaping for a task: over bricks without a visible value and without a surface.
 
         task: with the table that samples take.
         """
-        distance = bricks.distance(task)
+        arrays, distance = field.arrays, field.bricks.distance(task)
         last = arrays.array(np.array(distance.shape[::-1]) - 1.0)
         return cls(
             arrays=arrays,
             distance=arrays.array(distance, "int64"),
             last=last,
-            first=first,
-            side=float(SIDE),
+            first=field.first,
+            side=float(SIDE * field.stride),
         )
 
     def matters(self, places: Array) -> Array:
