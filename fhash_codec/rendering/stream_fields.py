@@ -151,11 +151,11 @@ class Field(Protocol):
         ...
 
 
-def central_slopes(field: Field, places: Array) -> Array:
+def central_slopes(field: Field, places: Array, own: Field) -> Array:
     """Slopes (n, 3) at places (n, 3) by central differences.
 
     They are over one vertex before and behind along each axis, clamped to those of the field. Where
-    one of the two has no value, the field's own slope along that axis stands.
+    one of the two has no value, the slope of `own` along that axis stands.
     """
     arrays, xp, (low, high) = field.arrays, field.arrays.xp, field.vertices.T
     away = float(field.stride)
@@ -172,7 +172,7 @@ def central_slopes(field: Field, places: Array) -> Array:
     (missing,) = arrays.nonzero(xp.any(xp.isnan(slopes), axis=1))
     if len(missing):
         slopes[missing] = xp.where(
-            xp.isnan(slopes[missing]), field.slopes(places[missing]), slopes[missing]
+            xp.isnan(slopes[missing]), own.slopes(places[missing]), slopes[missing]
         )
     return slopes
 
@@ -760,7 +760,9 @@ class Factors:
         """Factors (n,) of the extinction at places (n, 3) of the domain."""
         xp = self._arrays.xp
         slopes = (
-            central_slopes(self._field, places) if self._central else self._field.slopes(places)
+            central_slopes(self._field, places, self._field)
+            if self._central
+            else self._field.slopes(places)
         ) / self._spacing
         entry = xp.clip(xp.sqrt(xp.sum(slopes * slopes, axis=1)) * self._scale, 0.0, float(GRADES))
         before = self._arrays.to_int64(entry)

@@ -681,8 +681,8 @@ class Phong:
             of the table's range per vertex spacing.
         floor: gradient at which the light from a direction has faded by half, so that the noise of
             rounding is not lit.
-        field: whose gradients are taken.
-        central: whether by central differences.
+        field: whose gradients are taken where `differences` is None or has none.
+        differences: the field whose central differences are taken.
     """
 
     arrays: Arrays
@@ -691,7 +691,7 @@ class Phong:
     scale: Array
     floor: float
     field: Field
-    central: bool
+    differences: Field | None
 
     @classmethod
     def of(cls, task: Task, field: Field) -> Phong | None:
@@ -710,13 +710,15 @@ class Phong:
             lamp=None if lighting.lamp is None else arrays.array(lighting.lamp, "float64"),
             scale=arrays.array(slope_scale(task.rays.grid, span, least, most)),
             floor=floor,
-            field=smooth or field,
-            central=lighting.central or smooth is not None,
+            field=field,
+            differences=smooth or (field if lighting.central else None),
         )
 
     def slopes(self, places: Array) -> Array:
         """Derivatives (n, 3) by x, y and z per vertex, for shading."""
-        return central_slopes(self.field, places) if self.central else self.field.slopes(places)
+        if self.differences is None:
+            return self.field.slopes(places)
+        return central_slopes(self.differences, places, self.field)
 
     def __call__(
         self, colours: Array, slopes: Array, along: Array, lamp: Array, around: Array

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy.typing as npt
 import pytest
-from frame_field import FrameField, frame_of, table_of, task_of
+from frame_field import field_of, frame_of, table_of, task_of
 
 from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march_task import Arrays, Lighting, Surface, Task
-from fhash_codec.rendering.renderer import decoded_frame
 from fhash_codec.rendering.scenes import Camera
 from fhash_codec.rendering.stream_fields import Field, NetworkField
+from fhash_codec.rendering.tiled_frame import decoded_frame
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def frame_task() -> Callable[..., tuple[FrameField, Task]]:
             surfaces=surfaces,
             lighting=ambient if surfaces else None,
         )
-        return FrameField(frame_of(values), task.rays.grid), task
+        return field_of(frame_of(values), task.rays.grid), task
 
     return of
 
@@ -57,8 +58,6 @@ def planned() -> Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]:
             )
         )
         task, grid = plan.task, plan.task.rays.grid
-        # The noise of coding smooths what the native marcher alone shades.
-        task = replace(task, noise=0.0, error=0.0)
         if volume.profile == "paper":
             return NetworkField(volume, plan.step, plan.units, arrays), task
         frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
@@ -67,6 +66,6 @@ def planned() -> Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]:
                 frame, task, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion
             )
             task = replace(task, light=light)
-        return FrameField(frame, grid, arrays), task
+        return field_of(frame, grid, arrays), task
 
     return of

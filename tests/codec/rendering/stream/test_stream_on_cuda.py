@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
-from frame_field import NETWORK_SCENES, SCENES, FrameField
+from frame_field import NETWORK_SCENES, SCENES
 from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
 import fhash_codec
@@ -21,6 +21,7 @@ from fhash_codec import Volume
 from fhash_codec.paper.engines.fused import program as driver
 from fhash_codec.paper.engines.fused.engine import FusedPoints
 from fhash_codec.rendering import stream_march as canvas
+from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Task
 from fhash_codec.rendering.plan import arrays_on
 from fhash_codec.rendering.stream_fields import Field
