@@ -104,10 +104,10 @@ ROUNDING = 2.0**-22
 largest magnitude.
 """
 LAYERS = 4
-"""Layers of bricks that a thread looks at together."""
+"""Layers or rows of bricks that a thread looks at together."""
 CACHED = 3
 """Results of each kind that bricks keep, by default: those of the last transfer functions."""
-SMALL = 2**18
+SMALL = 2**19
 """Vertices of a frame below which threads take longer to start than the work takes."""
 
 
@@ -136,7 +136,7 @@ class Bricks:
         """The bricks of a frame, found in a time that is short beside that of a picture."""
         values = np.ascontiguousarray(frame.values, dtype=np.float32)
         low, high = extremes(values)
-        if np.isneginf(low).any() or np.isposinf(high).any():
+        if not finite(low, high):
             values = np.where(np.isfinite(values), values, np.float32(np.nan))
             low, high = extremes(values)
         least, most = float(low.min()), float(high.max())
@@ -173,24 +173,17 @@ class Bricks:
 
     def matters(self, task: Task) -> Mask:
         """Whether a brick (z, y, x) has anything visible: a value with extinction, or a surface."""
-        slack = ROUNDING * max(map(abs, self.value_range))
-        palette = None if task.table is None else Palette.of(task.table)
-        visible = np.empty(self.low.shape, dtype=bool)
+        limits, visible = limits_of(self, task), np.zeros(self.low.shape, dtype=bool)
+        if len(limits) > MAX_LIMITS:
+            limits = limits[[0, -1]].reshape(1, 4)[:, [0, 3]]
 
-        def look(first: int) -> None:
+        def look(first: int, stop: int) -> None:
             """Look at layers of bricks."""
-            layers = slice(first, first + LAYERS)
-            low, high = self.low[layers].astype(np.float64), self.high[layers].astype(np.float64)
-            has_value = low <= high
-            low, high = np.where(has_value, low, 0.0), np.where(has_value, high, 0.0)
-            seen = np.zeros(low.shape, dtype=bool)
-            if palette is not None:
-                seen |= np.asarray(palette.visible(low, high))
-            for surface in task.surfaces:
-                seen |= (low - slack <= surface.value) & (surface.value <= high + slack)
-            visible[layers] = seen & has_value
+            layers = slice(first, stop)
+            for low, high in limits:
+                visible[layers] |= (self.low[layers] < high) & (self.high[layers] > low)
 
-        _in_turn(look, range(0, len(visible), LAYERS), self.values.size)
+        _in_turn(look, len(visible), self.values.size)
         return visible
 
     def distance(self, task: Task) -> npt.NDArray[np.int32]:
@@ -216,28 +209,36 @@ def _counts(values: Single) -> list[int]:
     return [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
 
 
+def finite(low: Single, high: Single) -> bool:
+    """Whether bricks of these smallest and largest values have no infinite one."""
+    return not (np.isneginf(low).any() or np.isposinf(high).any())
+
+
 def extremes(values: Single) -> tuple[Single, Single]:
     """The smallest and the largest value of each brick, as the attributes of `Bricks` have them."""
     bricks = _counts(values)
     low, high = np.empty(bricks, dtype=np.float32), np.empty(bricks, dtype=np.float32)
     library = native.library()
     shape, counts = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*bricks)
+    assert values.strides[2] == values.itemsize
+    strides = (ctypes.c_int64 * 2)(*(stride // values.itemsize for stride in values.strides[:2]))
 
-    def layer(number: int) -> None:
+    def layers(first: int, stop: int) -> None:
         scratch = np.empty(2 * values.shape[2], dtype=np.float32)
         library.fhash_march_bricks(
             values.ctypes.data,
             shape,
+            strides,
             counts,
             SIDE,
-            number,
-            number + 1,
+            first,
+            stop,
             low.ctypes.data,
             high.ctypes.data,
             scratch.ctypes.data,
         )
 
-    _in_turn(layer, range(bricks[0]), values.size)
+    _in_turn(layers, bricks[0], values.size)
     return low, high
 
 
@@ -247,36 +248,21 @@ def nearest(distance: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     layers, rows = library.fhash_march_distance_layers, library.fhash_march_distance_rows
     for count, function in zip(distance.shape, (layers, rows), strict=False):
 
-        def find(number: int, function: Callable[..., object] = function) -> None:
+        def find(first: int, stop: int, function: Callable[..., object] = function) -> None:
             scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
-            function(shape, distance.ctypes.data, number, number + 1, scratch.ctypes.data)
+            function(shape, distance.ctypes.data, first, stop, scratch.ctypes.data)
 
-        _in_turn(find, range(count), distance.size * SIDE**3)
+        _in_turn(find, count, distance.size * SIDE**3)
     return distance
 
 
-def reduced(
-    values: npt.NDArray[Any],
-    begin: npt.NDArray[np.int64],
-    end: npt.NDArray[np.int64],
-    axis: int,
-    reduce: np.ufunc,
-) -> npt.NDArray[Any]:
-    """Reduce the spans `begin` to `end`, both included, of an axis."""
-    moved = np.moveaxis(values, axis, 0)
-    parts = [
-        reduce.reduce(moved[low : high + 1], axis=0) for low, high in zip(begin, end, strict=True)
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.stack(parts), 0, axis))
-
-
-def _in_turn(function: Callable[[int], object], numbers: range, vertices: int) -> None:
-    """Call a function with numbers: in several threads, if the frame has enough vertices."""
+def _in_turn(function: Callable[[int, int], object], count: int, vertices: int) -> None:
+    """Call a function with spans of 0 to `count`: in threads, if the frame has enough vertices."""
     if vertices < SMALL:
-        for number in numbers:
-            function(number)
+        function(0, count)
     else:
-        list(in_threads(function, numbers))
+        spans = [(first, min(first + LAYERS, count)) for first in range(0, count, LAYERS)]
+        list(in_threads(lambda span: function(*span), spans))
 
 
 REACH = 3.0

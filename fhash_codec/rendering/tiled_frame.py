@@ -20,9 +20,9 @@ from fhash_codec.rendering.bricks import (
     SIDE,
     Bricks,
     extremes,
+    finite,
     nearest,
     reach_of,
-    reduced,
     smoothed,
 )
 from fhash_codec.rendering.grid import Warp
@@ -136,17 +136,19 @@ class TiledFrame:
             (int(starts[first]), int(starts[end]))
             for starts, (first, end) in zip(self.starts, blocks, strict=True)
         ]
-        part = self._part(spans)
-        # As in bricks: there an infinite value is none.
-        self.frame.values[_slices(spans)] = np.where(np.isinf(part), np.float32(np.nan), part)
+        self.frame.values[_slices(spans)] = self._part(spans)
         touched = [
             (max(first - 1, 0) // SIDE, min((end - 1) // SIDE + 1, count))
             for (first, end), count in zip(spans, self.bricks.low.shape, strict=True)
         ]
         with self.lock:
             self.decoded[_slices(blocks)] = True
-            found = extremes(np.ascontiguousarray(self.frame.values[brick_vertices(touched)]))
-            self.bricks.low[_slices(touched)], self.bricks.high[_slices(touched)] = found
+            values = self.frame.values[brick_vertices(touched)]
+            low, high = extremes(values)
+            if not finite(low, high):
+                values[np.isinf(values)] = np.nan
+                low, high = extremes(values)
+            self.bricks.low[_slices(touched)], self.bricks.high[_slices(touched)] = low, high
 
     def _part(self, spans: Spans) -> Single:
         """The values of a part of the frame, decoded and resampled where axes are uneven."""
@@ -290,13 +292,19 @@ class Fetching:
                 (int(first[n]), int(last[n]))
                 for first, last, n in zip(self._first, self._last, place, strict=True)
             ]
-            for block in product(*(range(first, last + 1) for first, last in ends)):
+            blocks = list(product(*(range(first, last + 1) for first, last in ends)))
+            new = [block for block in blocks if not self._tiles.decoded[block]]
+            for block in blocks:
                 self._tiles.decode(block)
+            # Of bricks that read a new block; of this one where other threads have decoded all.
+            ends = [(min(along), max(along)) for along in zip(*new, strict=True)]
             self._update(
                 [
                     (int(np.searchsorted(last, low)), int(np.searchsorted(first, high, "right")))
                     for first, last, (low, high) in zip(self._first, self._last, ends, strict=True)
                 ]
+                if new
+                else [(int(n), int(n) + 1) for n in place]
             )
         except BaseException as error:  # it is raised again where the march ends
             self.error = error
@@ -308,9 +316,14 @@ class Fetching:
         part, tiles = _slices(bricks), self._tiles
         with tiles.lock:
             ready = tiles.decoded
-            for axis in range(3):
-                first, last = self._first[axis][part[axis]], self._last[axis][part[axis]]
-                ready = reduced(ready, first, last, axis, np.logical_and)
+            for axis, along in enumerate(part):
+                first, last = self._first[axis][along], self._last[axis][along]
+                ready = np.logical_and.reduce(
+                    [
+                        np.take(ready, np.minimum(first + n, last), axis)
+                        for n in range(int(np.max(last - first)) + 1)
+                    ]
+                )
             found = replace(
                 tiles.bricks,
                 values=tiles.frame.values[brick_vertices(bricks)],
@@ -318,9 +331,12 @@ class Fetching:
                 high=tiles.bricks.high[part],
             )
             if self._by == "distance":
-                hidden = np.where(ready & ~found.matters(self._task), FARTHEST, 0).astype(np.int32)
                 # Beyond these bricks any may matter.
-                self.fields["distance"][part] = nearest(np.pad(hidden, 1))[1:-1, 1:-1, 1:-1]
+                distance = np.zeros([n + 2 for n in ready.shape], np.int32)
+                inner = distance[1:-1, 1:-1, 1:-1]
+                inner[ready & ~found.matters(self._task)] = FARTHEST
+                nearest(distance)
+                self.fields["distance"][part] = inner
             elif self._by == "highest":
                 largest = found.high if self._task.projection == "maximum" else -found.low
                 np.copyto(self.fields["highest"][part], largest, where=ready)

@@ -69,7 +69,8 @@ void make_bricks(Reader& in, Switches flags, FhashMarch& m, Arrays& arrays) {
     arrays.lowest.resize(static_cast<std::size_t>(bricks));
     arrays.highest.resize(arrays.lowest.size());
     arrays.scratch.resize(static_cast<std::size_t>(2 * m.shape[2]));
-    fhash_march_bricks(m.values, m.shape, m.bricks, FHASH_BRICK, 0, m.bricks[0],
+    const int64_t strides[] = {m.shape[1] * m.shape[2], m.shape[2]};
+    fhash_march_bricks(m.values, m.shape, strides, m.bricks, FHASH_BRICK, 0, m.bricks[0],
                        arrays.lowest.data(), arrays.highest.data(), arrays.scratch.data());
     arrays.distance.resize(arrays.lowest.size());
     const std::vector<std::uint8_t> matters = repeated<std::uint8_t>(in, bricks);
