@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import MAX_LOD, Box
 from fhash_codec.devices import choose_device, may_have_cuda
+from fhash_codec.rendering.bricks import SIDE
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
 from fhash_codec.rendering.grid import Grid
@@ -24,8 +25,18 @@ from fhash_codec.rendering.light import (
     secondary_light,
     shading_of,
 )
-from fhash_codec.rendering.march_task import MAX_VALUES, NUMPY, Arrays, Surface, Table, Task, Units
+from fhash_codec.rendering.march_task import (
+    MAX_VALUES,
+    NUMPY,
+    Arrays,
+    Surface,
+    Table,
+    Task,
+    Units,
+    extinctions_in,
+)
 from fhash_codec.rendering.scenes import DEVICES, AmbientOcclusion, Effects, Scene, Shadows
+from fhash_codec.rendering.tiled_frame import block_sizes
 from fhash_codec.rendering.transfer_function import Histogram, TransferFunction, about
 from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
@@ -231,7 +242,8 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
         )
         return f"cache: decode once, then march what was decoded{why}{lattice}"
     if not plan.network and not plan.streams:
-        return f"arm: decode a tile when the first ray comes to it{why}"
+        tiles = "all tiles, which light needs" if plan.lights else "a tile when a ray comes to it"
+        return f"arm: decode {tiles}{why}"
     through = (
         "straight through the network, which has values of its own between vertices (cache is "
         "linear there)"
@@ -377,18 +389,19 @@ def plan_picture(
         task, error=error, grading=grading_of(scene.transfer_function, volume, units, grid)
     )
     _check_ray_length(task)
-    mode, why_mode = _mode(volume, scene)
+    margin = _margin(task, lod)
+    # Light comes from all of the volume, whether it is in view or not.
+    domain = region_of_body(volume, task.body, grid.warp, margin)
+    lit = shadows is not None or occlusion is not None
+    region = domain if lit else region_in_view(rays, volume, task.body, margin)
+    ends = not lit and _ends_rays(task) and _many_blocks(volume, region, lod)
+    mode, why_mode = _mode(volume, scene, ends)
     network = volume.profile == "paper" and mode != "cache"
     # In packets of rays march a processor's, but through networks on even axes alone.
     streams = mode == "stream" or (
         mode == "arm"
         and ((network and grid.warp is not None) or arrays_of(volume, scene) is not NUMPY)
     )
-    margin = _margin(task, lod)
-    # Light comes from all of the volume, whether it is in view or not.
-    domain = region_of_body(volume, task.body, grid.warp, margin)
-    lit = shadows is not None or occlusion is not None
-    region = domain if lit else region_in_view(rays, volume, task.body, margin)
     if lit or not network:
         _check_frame(region, lod)
     plan = Plan(
@@ -652,8 +665,29 @@ def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
         )
 
 
-def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
-    """The way to march, and why 'auto' took it; InputError for one that cannot be had."""
+def _ends_rays(task: Task) -> bool:
+    """Whether rays end early: at an opaque surface, or where most colours are opaque in a brick."""
+    if task.projection:
+        return False
+    if any(surface.opacity >= 1 - task.threshold for surface in task.surfaces):
+        return True
+    if task.table is None:
+        return False
+    left = np.exp(-extinctions_in(task.table.extinctions, SIDE * task.rays.grid.vertex_spacing))
+    return bool(np.median(left) <= task.threshold)
+
+
+def _many_blocks(volume: Volume, region: Box, lod: int) -> bool:
+    """Whether a frame has as many blocks as two along each axis: fewer are seldom left out."""
+    sizes = block_sizes(volume, lod)
+    return math.prod(-(-n // size) for n, size in zip(region.shape, sizes, strict=True)) >= 8
+
+
+def _mode(volume: Volume, scene: Scene, ends: bool) -> tuple[str, str]:
+    """The way to march, and why 'auto' took it; InputError for one that cannot be had.
+
+    ends: whether rays end before they have seen most of a decoded frame.
+    """
     march, network = scene.march, volume.profile == "paper"
     if march.mode == "cache" and march.device == "cuda":
         raise InputError(
@@ -665,7 +699,9 @@ def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
         return "arm", "chosen for the GPU"
     if _few_samples(volume, scene):
         return "arm", "chosen since so few samples cost less than decoding the frame"
-    return "cache", "as is fastest on a CPU"
+    if ends and not network:
+        return "arm", "chosen since rays end at what is opaque and need no tile behind it"
+    return "cache", "as is fastest on a CPU" + ("" if network else " where rays need most tiles")
 
 
 def arrays_of(volume: Volume, scene: Scene) -> Arrays:

@@ -82,10 +82,9 @@ class TiledFrame:
         self._lattice = lattice = _lattice(volume, lod, region)
         drawn, self._at = zip(*drawn_places(lattice, stride, warp), strict=True)
         self.starts = []
-        for at, own, (first, _), chunk in zip(
-            self._at, lattice, volume.box, volume.chunks[1:], strict=True
+        for at, own, (first, _), size in zip(
+            self._at, lattice, volume.box, block_sizes(volume, lod), strict=True
         ):
-            size = chunk * max(1, -(-(BLOCK << lod) // chunk))
             number = (own.start - first + np.floor(at) * stride) // size
             self.starts.append(np.array([0, *np.flatnonzero(np.diff(number)) + 1, len(at)]))
         self.decoded = np.full([len(starts) - 1 for starts in self.starts], whole)
@@ -165,6 +164,11 @@ class TiledFrame:
         return resampled(
             values, [at - low for at, low in zip(places, lows, strict=True)], self._warp
         )
+
+
+def block_sizes(volume: Volume, lod: int) -> list[int]:
+    """Vertices of the series along the sides (z, y, x) of a block."""
+    return [chunk * -(-(BLOCK << lod) // chunk) for chunk in volume.chunks[1:]]
 
 
 def _lattice(volume: Volume, lod: int, region: Box) -> list[range]:
