@@ -78,6 +78,14 @@ def waves(shape: tuple[int, ...] = (20, 17, 30), pace: float = 1.0) -> np.ndarra
     return values.astype(np.float32)
 
 
+def blobs() -> np.ndarray:
+    """Two blobs that move apart, (t, z, y, x) float32, about 0 .. 10."""
+    t, z, y, x = np.meshgrid(*map(np.arange, (3, 20, 24, 28)), indexing="ij", sparse=True)
+    first = 9 * np.exp(-((z - 9) ** 2 + (y - 10) ** 2 + (x - 9 + 2 * t) ** 2) / 14)
+    second = 7 * np.exp(-((z - 12) ** 2 + (y - 14) ** 2 + (x - 19 - 2 * t) ** 2) / 10)
+    return (first + second + 0.05 * np.sin(x / 3)).astype(np.float32)
+
+
 CENTRAL: dict[str, Any] = {
     "effects": {
         "shading": {"light": [1, 2, 3], "gradient": "central"},

@@ -7,22 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from frame_field import by_stream
+from frame_field import blobs, by_stream
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march_task import Arrays
-
-SHAPE = (3, 20, 24, 28)
-
-
-def blobs() -> np.ndarray:
-    """Two blobs that move apart, (t, z, y, x) float32, about 0 .. 10."""
-    t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
-    first = 9 * np.exp(-((z - 9) ** 2 + (y - 10) ** 2 + (x - 9 + 2 * t) ** 2) / 14)
-    second = 7 * np.exp(-((z - 12) ** 2 + (y - 14) ** 2 + (x - 19 - 2 * t) ** 2) / 10)
-    return (first + second + 0.05 * np.sin(x / 3)).astype(np.float32)
 
 
 @pytest.fixture(params=["native", "streamed"])
