@@ -365,8 +365,8 @@ class Marching(Record):
     )
     samples_per_pass: int | None = limits(
         None,
-        "N_r of adaptive ray marching on a GPU, and on uneven axes: samples in a pass; the number "
-        "of rays if left out",
+        "N_r of adaptive ray marching in passes, on a GPU and through networks on uneven axes: "
+        "samples in a pass; the number of rays if left out",
         low=1,
         high=2**40,
     )
