@@ -116,8 +116,8 @@ template <Leaps BY> int Packet::leap(Counters& counted) {
 #endif
 }
 
-// Let the frame fetch what the samples of this pass read. Returns whether anything was missing: then
-// bricks may be invisible that were not known. Where it fails, the rays end.
+// Let the frame fetch what the samples of this pass read. Returns whether anything was missing:
+// then bricks may be invisible that were not known. Where it fails, the rays end.
 bool Packet::fetch() {
     const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];

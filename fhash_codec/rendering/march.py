@@ -315,12 +315,11 @@ COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks", "evaluati
 
 def march_native(
     library: ctypes.CDLL,
-    frame: Frame,
+    frame: Frame | TiledFrame,
     task: Task,
     bricks: Bricks,
     threads: int | None = None,
     *,
-    tiles: TiledFrame | None = None,
     path: int = 0,
     progress: Progress = silent,
 ) -> Marched:
@@ -329,6 +328,8 @@ def march_native(
     path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
     every processor has. The pictures agree within rounding.
     """
+    tiles = frame if isinstance(frame, TiledFrame) else None
+    frame = frame.frame if isinstance(frame, TiledFrame) else frame
     assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
     task = task.marched
     given, fetching = MarchInput.of(frame, task, bricks), None
@@ -551,11 +552,10 @@ def _tiles(ends: npt.NDArray[np.float64], limits: tuple[int, int]) -> tuple[int,
 
 
 def march(
-    frame: Frame,
+    frame: Frame | TiledFrame,
     task: Task,
     *,
     bricks: Bricks | None = None,
-    tiles: TiledFrame | None = None,
     threads: int | None = None,
     progress: Progress = silent,
 ) -> Marched:
@@ -571,10 +571,9 @@ def march(
     mean begins; the nearest one of several rays of a pixel.
 
     Args:
-        frame: the values.
+        frame: the values; those of a `TiledFrame` are decoded where rays reach them.
         task: what to march.
         bricks: of the frame; made if None.
-        tiles: decodes what rays reach, where the frame is not decoded yet; None where it is.
         threads: most threads; None for all processors.
         progress: is told of the rows that are done.
 
@@ -583,20 +582,16 @@ def march(
     if len(task.surfaces) > MAX_SURFACES:
         raise InputError(f"a picture has {len(task.surfaces)} surfaces; allowed: {MAX_SURFACES}")
     if bricks is None:
-        bricks = Bricks.of(frame)
+        bricks = frame.bricks if isinstance(frame, TiledFrame) else Bricks.of(frame)
     if task.projection and task.surfaces:
         surfaces = dataclasses.replace(task, projection="", table=None, shaded=False)
         projection = dataclasses.replace(task, surfaces=())
         front, back = (
-            march_native(
-                native.library(), frame, part, bricks, threads, tiles=tiles, progress=progress
-            )
+            march_native(native.library(), frame, part, bricks, threads, progress=progress)
             for part in (surfaces, projection)
         )
         return _over(front, back)
-    return march_native(
-        native.library(), frame, task, bricks, threads, tiles=tiles, progress=progress
-    )
+    return march_native(native.library(), frame, task, bricks, threads, progress=progress)
 
 
 def _over(front: Marched, back: Marched) -> Marched:

@@ -288,10 +288,8 @@ class Renderer:
         """March the rays of a task through a decoded frame."""
         frame, bricks = tiles.frame, tiles.bricks
         if not plan.streams:
-            missing = None if plan.decodes_all or tiles.decoded.all() else tiles
-            return march(
-                frame, task, bricks=bricks, tiles=missing, threads=self.threads, progress=progress
-            )
+            source = frame if tiles.decoded.all() else tiles
+            return march(source, task, bricks=bricks, threads=self.threads, progress=progress)
         arrays = arrays_of(self.volume, plan.scene)
         marched = stream(
             FrameField(frame, bricks, task.rays.grid, arrays),

@@ -239,7 +239,7 @@ def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Uni
 
 
 class Fetching:
-    """What a march reads of a frame whose blocks are decoded when rays come to them.
+    """The state of a march through a frame whose blocks are decoded when rays come to them.
 
     A brick is ready where all is decoded that a sample in it reads. Bricks that are not ready
     matter to every ray.
