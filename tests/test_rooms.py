@@ -73,7 +73,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("bricks", "torch_arrays"),
         ("light", "tiled_frame"),
         ("layout", "march", "stream_fields"),
-        ("frame_field", "image", "plan", "stream_march"),
+        ("image", "plan", "stream_march"),
         ("renderer",),
         ("timeline", "tracking"),
         ("film",),

@@ -7,6 +7,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -254,6 +255,22 @@ def nearest(distance: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
 
         _in_turn(find, count, distance.size * SIDE**3)
     return distance
+
+
+CORNERS = tuple(product((0, 1), repeat=3))
+"""Corners (z, y, x) of a cell: 0 for the vertex before a place, 1 for the one after it."""
+
+
+def of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
+    """Reduce the eight vertices of each cell (z, y, x) by a function of two arrays.
+
+    An axis of one vertex has one cell.
+    """
+    for axis in range(3):
+        if values.shape[axis] > 1:
+            before = (slice(None),) * axis
+            values = reduce(values[(*before, slice(None, -1))], values[(*before, slice(1, None))])
+    return values
 
 
 def _in_turn(function: Callable[[int, int], object], count: int, vertices: int) -> None:

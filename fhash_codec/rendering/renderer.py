@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.image import Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
@@ -26,7 +25,7 @@ from fhash_codec.rendering.plan import Plan, arrays_of, plan_at, plan_picture
 from fhash_codec.rendering.scenes import MAX_SIDE, Scene
 from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField
 from fhash_codec.rendering.stream_march import stream
-from fhash_codec.rendering.tiled_frame import TiledFrame
+from fhash_codec.rendering.tiled_frame import FrameField, TiledFrame
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_codec.volume import Volume, only_features
 from fhash_formats.errors import FhashError, InputError

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -12,7 +10,7 @@ import numpy.typing as npt
 
 from fhash_codec.paper.model import PaperModel, PointSampler, PointTables
 from fhash_codec.paper.network import Network
-from fhash_codec.rendering.bricks import SIDE, Bricks, Palette
+from fhash_codec.rendering.bricks import CORNERS, SIDE, Bricks, Palette, of_cells
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Warp
 from fhash_codec.rendering.march_task import (
@@ -82,10 +80,6 @@ class HostInference:
         x, y, z = self._arrays.host(places).T
         self.sampler.sample((np.zeros(1), z, y, x), values, slopes, usable_threads())
         return values
-
-
-CORNERS = tuple(product((0, 1), repeat=3))
-"""Corners (z, y, x) of a cell: 0 for the vertex before a place, 1 for the one after it."""
 
 
 class Field(Protocol):
@@ -311,18 +305,6 @@ def _possible(in_coreset: npt.NDArray[np.bool_], low: float, high: float) -> Bri
         high=np.where(has_value, np.float32(high), np.float32(-np.inf)),
         value_range=(low, high) if has_value.any() else (0.0, 0.0),
     )
-
-
-def of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
-    """Reduce the eight vertices of each cell (z, y, x) by a function of two arrays.
-
-    An axis of one vertex has one cell.
-    """
-    for axis in range(3):
-        if values.shape[axis] > 1:
-            before = (slice(None),) * axis
-            values = reduce(values[(*before, slice(None, -1))], values[(*before, slice(1, None))])
-    return values
 
 
 class WarpedField:

@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Frame, Marched, Table, Task
 from fhash_codec.rendering.scenes import Camera
 from fhash_codec.rendering.stream_march import stream
+from fhash_codec.rendering.tiled_frame import FrameField
 
 
 def field_of(frame: Frame, grid: Grid, arrays: Arrays = NUMPY) -> FrameField:

@@ -14,13 +14,12 @@ from frame_field import blobs, by_stream, field_of, frame_of, table_of, task_of
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
-from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march_task import Arrays, Lighting, Surface, Task
 from fhash_codec.rendering.scenes import Camera
 from fhash_codec.rendering.stream_fields import Field, NetworkField
-from fhash_codec.rendering.tiled_frame import decoded_frame
+from fhash_codec.rendering.tiled_frame import FrameField, decoded_frame
 
 
 @pytest.fixture(params=["native", "streamed"])

@@ -18,7 +18,6 @@ import fhash_codec
 from fhash_codec import Renderer, Scene, Volume, native
 from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.rendering.bricks import Palette
-from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march, march_native
@@ -44,6 +43,7 @@ from fhash_codec.rendering.stream_fields import (
     shares,
 )
 from fhash_codec.rendering.stream_march import Canvas, Events, stream
+from fhash_codec.rendering.tiled_frame import FrameField
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
 

@@ -21,11 +21,11 @@ from fhash_codec import Volume
 from fhash_codec.paper.engines.fused import program as driver
 from fhash_codec.paper.engines.fused.engine import FusedPoints
 from fhash_codec.rendering import stream_march as canvas
-from fhash_codec.rendering.frame_field import FrameField
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Task
 from fhash_codec.rendering.plan import arrays_on
 from fhash_codec.rendering.stream_fields import Field
 from fhash_codec.rendering.stream_march import stream
+from fhash_codec.rendering.tiled_frame import FrameField
 
 Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
 
