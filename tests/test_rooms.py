@@ -71,7 +71,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("transfer_function", "view"),
         ("march_task",),
         ("bricks", "torch_arrays"),
-        ("light",),
+        ("light", "tiled_frame"),
         ("layout", "march", "stream_fields"),
         ("image", "plan", "stream_march"),
         ("renderer",),

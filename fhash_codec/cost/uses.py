@@ -24,7 +24,7 @@ from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, complete, warped
 from fhash_codec.rendering.plan import Plan
-from fhash_codec.rendering.renderer import Renderer, decoded_frame
+from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import (
     AmbientOcclusion,
     AttenuatedMaximum,
@@ -35,6 +35,7 @@ from fhash_codec.rendering.scenes import (
     Shading,
     Shadows,
 )
+from fhash_codec.rendering.tiled_frame import decoded_frame
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import Series

@@ -26,7 +26,7 @@ PROTOTYPES: Prototypes = {
     # march.cpp
     "fhash_march": (ARRAY, INTEGER, INTEGER, INTEGER, ARRAY),
     # march_bricks.cpp
-    "fhash_march_bricks": (*(ARRAY,) * 3, *(INTEGER,) * 3, *(ARRAY,) * 3),
+    "fhash_march_bricks": (*(ARRAY,) * 4, *(INTEGER,) * 3, *(ARRAY,) * 3),
     "fhash_march_distance_layers": (ARRAY, ARRAY, INTEGER, INTEGER, ARRAY),
     "fhash_march_distance_rows": (ARRAY, ARRAY, INTEGER, INTEGER, ARRAY),
     "fhash_march_cells": (*(ARRAY,) * 4, INTEGER, ARRAY, INTEGER, INTEGER, ARRAY),

@@ -21,7 +21,7 @@ FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t
     const FhashMarch& m = *march;
     if (m.surfaces < 0 || m.surfaces > FHASH_SURFACES) return -1;
     if (m.entries < 2 || m.rays < 1 || !(m.step > 0)) return -1;
-    if (m.cells && !m.distance) return -1;
+    if ((m.cells && !m.distance) || (m.ready && !m.fetch)) return -1;
     if (m.planes < 0 || m.planes > FHASH_PLANES) return -1;
     if ((flags & GRADED) && !m.grading) return -1;
     FhashTiles* tiles = fhash_march_v1;

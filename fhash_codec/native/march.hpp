@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -22,6 +23,9 @@ using FhashNetwork = std::int64_t (*)(const std::int64_t* sizes, const std::int6
                                       const std::int64_t* layers, const std::int64_t* columns,
                                       std::int64_t count, std::int64_t path, float* values,
                                       float* slopes, float* by_inputs);
+
+// Decodes what the samples in a brick read, and is nonzero where that fails.
+using FhashFetch = std::int64_t (*)(std::int64_t brick);
 
 // Mirrored field by field in fhash_codec/rendering/march.py. All places and directions
 // are in vertices of the frame, x, y, z.
@@ -88,6 +92,9 @@ extern "C" struct FhashMarch {
     std::int64_t network_whole;  // whether there is a value at all places of the frame
     double network_low, network_span;  // the value of its 0, and the change to that of its 1
     std::int64_t* network_status;      // takes what it returns where it fails
+    // A frame that is decoded while it is marched.
+    const std::int32_t* ready;  // (z, y, x) of bricks: whether what samples in it read is there; or
+    FhashFetch fetch;           // null where all is there
 };
 
 // `fhash_march` for a target.

@@ -98,11 +98,13 @@ int64_t bit_count(uint64_t bits) {
 }  // namespace
 
 // The smallest and the largest value of bricks, the vertices of their faces included; infinity and
-// minus infinity where a brick has no value. values: (z, y, x) of `shape`. side: cells of a brick.
-// first, stop: layers of bricks. low, high: (z, y, x) of `bricks`. scratch: 2 rows of x.
+// minus infinity where a brick has no value. values: (z, y, x) of `shape`. strides: values from a
+// layer to the next and from a row to the next. side: cells of a brick. first, stop: layers of
+// bricks. low, high: (z, y, x) of `bricks`. scratch: 2 rows of x.
 FHASH_EXPORT int64_t fhash_march_bricks(const float* values, const int64_t* shape,
-                                        const int64_t* bricks, int64_t side, int64_t first,
-                                        int64_t stop, float* low, float* high, float* scratch) {
+                                        const int64_t* strides, const int64_t* bricks,
+                                        int64_t side, int64_t first, int64_t stop, float* low,
+                                        float* high, float* scratch) {
     const float far = std::numeric_limits<float>::infinity();
     const int64_t nz = shape[0], ny = shape[1], nx = shape[2];
     float* const least = scratch;
@@ -113,7 +115,7 @@ FHASH_EXPORT int64_t fhash_march_bricks(const float* values, const int64_t* shap
             std::fill(most, most + nx, -far);
             for (int64_t z = bz * side; z < min(bz * side + side + 1, nz); z++)
                 for (int64_t y = by * side; y < min(by * side + side + 1, ny); y++)
-                    extend(values + (z * ny + y) * nx, nx, least, most);
+                    extend(values + z * strides[0] + y * strides[1], nx, least, most);
             for (int64_t bx = 0; bx < bricks[2]; bx++) {
                 const int64_t at = (bz * bricks[1] + by) * bricks[2] + bx;
                 const int64_t end = min(bx * side + side + 1, nx);

@@ -133,7 +133,8 @@ FHASH_INLINE void Packet::march(Counters& counted) {
     const float stop = max((float)m.threshold, 1e-37f);
     if (skipping && m.surfaces > 0) meet(counted);
     for (int since = 0;;) {
-        const int state = skipping ? skip(counted) : alive();
+        int state = skipping ? skip(counted) : alive();
+        while (m.ready && fetch()) state = skipping ? skip(counted) : alive();
         if (!state) break;
         if (!(state & 1)) continue;
         counted.passes++;

@@ -165,6 +165,7 @@ struct Packet {
     // march_skip.hpp
     FHASH_INLINE int skip(Counters& counted);
     template <Leaps BY> int leap(Counters& counted);
+    bool fetch();
     bool visible(int l, double sample) const;
     void meet(Counters& counted);
     void part_ways(const int* leapt, Counters& counted);

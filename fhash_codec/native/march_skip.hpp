@@ -116,6 +116,27 @@ template <Leaps BY> int Packet::leap(Counters& counted) {
 #endif
 }
 
+// Let the frame fetch what the samples of this pass read. Returns whether anything was missing:
+// then bricks may be invisible that were not known. Where it fails, the rays end.
+bool Packet::fetch() {
+    const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
+    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
+    const int32_t* const ready = m.ready;
+    int missing = 0;
+    #pragma omp simd reduction(| : missing)
+    for (int l = 0; l < N; l++)
+        missing |= on[l] & !ready[spot_of(*this, l, lx, ly, lz, bx, by).brick];
+    std::atomic_thread_fence(std::memory_order_acquire);  // another thread may have fetched it
+    if (!missing) return false;
+    for (int l = 0; l < N; l++) {
+        const int brick = spot_of(*this, l, lx, ly, lz, bx, by).brick;
+        if (!on[l] || ready[brick] || !m.fetch(brick)) continue;
+        std::copy_n(count, N, k);
+        break;
+    }
+    return true;
+}
+
 // Whether the cell at a place of a ray is visible.
 bool Packet::visible(int l, double sample) const {
     int at[3];
@@ -126,6 +147,7 @@ bool Packet::visible(int l, double sample) const {
     }
     const int64_t side = FHASH_BRICK, row = at[2] / side * m.bricks[1] + at[1] / side;
     const int64_t q = row * m.bricks[2] + at[0] / side;
+    if (m.ready && !m.ready[q] && m.fetch(q)) return false;
     if (m.distance[q] > 0) return false;
     return !m.cells || !empty(m.cells, at[0], at[1], at[2], (int)q);
 }

@@ -7,6 +7,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -104,10 +105,10 @@ ROUNDING = 2.0**-22
 largest magnitude.
 """
 LAYERS = 4
-"""Layers of bricks that a thread looks at together."""
+"""Layers or rows of bricks that a thread looks at together."""
 CACHED = 3
 """Results of each kind that bricks keep, by default: those of the last transfer functions."""
-SMALL = 2**18
+SMALL = 2**19
 """Vertices of a frame below which threads take longer to start than the work takes."""
 
 
@@ -121,28 +122,33 @@ class Bricks:
         values: float32 (z, y, x), contiguous, the values of the frame with NaN for infinite ones.
         low, high: float32 (z, y, x) of bricks, the smallest and the largest value; infinity and
             minus infinity where a brick has no value.
+        value_range: the smallest and the largest value, of the series where it is known: then it
+            depends neither on the step nor on what is decoded. (0, 0) where there is none.
     """
 
     values: Single
     low: Single
     high: Single
+    value_range: tuple[float, float]
     _kept: dict[str, OrderedDict[object, Any]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, frame: Frame) -> Bricks:
         """The bricks of a frame, found in a time that is short beside that of a picture."""
         values = np.ascontiguousarray(frame.values, dtype=np.float32)
-        low, high = _extremes(values)
-        if np.isneginf(low).any() or np.isposinf(high).any():
+        low, high = extremes(values)
+        if not finite(low, high):
             values = np.where(np.isfinite(values), values, np.float32(np.nan))
-            low, high = _extremes(values)
-        return cls(values=values, low=low, high=high)
+            low, high = extremes(values)
+        least, most = float(low.min()), float(high.max())
+        ends = (least, most) if least <= most else (0.0, 0.0)
+        return cls(values=values, low=low, high=high, value_range=ends)
 
-    @property
-    def value_range(self) -> tuple[float, float]:
-        """The smallest and the largest value; (0, 0) where there is none."""
-        low, high = float(self.low.min()), float(self.high.max())
-        return (low, high) if low <= high else (0.0, 0.0)
+    @classmethod
+    def unknown(cls, values: Single) -> Bricks:
+        """The bricks of values that are still to come: without a value."""
+        low = np.full(_counts(values), np.inf, dtype=np.float32)
+        return cls(values=values, low=low, high=-low, value_range=(0.0, 0.0))
 
     def remembered(
         self, kind: str, key: object, compute: Callable[[], Result], most: int = CACHED
@@ -168,24 +174,17 @@ class Bricks:
 
     def matters(self, task: Task) -> Mask:
         """Whether a brick (z, y, x) has anything visible: a value with extinction, or a surface."""
-        slack = ROUNDING * max(map(abs, self.value_range))
-        palette = None if task.table is None else Palette.of(task.table)
-        visible = np.empty(self.low.shape, dtype=bool)
+        limits, visible = limits_of(self, task), np.zeros(self.low.shape, dtype=bool)
+        if len(limits) > MAX_LIMITS:
+            limits = limits[[0, -1]].reshape(1, 4)[:, [0, 3]]
 
-        def look(first: int) -> None:
+        def look(first: int, stop: int) -> None:
             """Look at layers of bricks."""
-            layers = slice(first, first + LAYERS)
-            low, high = self.low[layers].astype(np.float64), self.high[layers].astype(np.float64)
-            has_value = low <= high
-            low, high = np.where(has_value, low, 0.0), np.where(has_value, high, 0.0)
-            seen = np.zeros(low.shape, dtype=bool)
-            if palette is not None:
-                seen |= np.asarray(palette.visible(low, high))
-            for surface in task.surfaces:
-                seen |= (low - slack <= surface.value) & (surface.value <= high + slack)
-            visible[layers] = seen & has_value
+            layers = slice(first, stop)
+            for low, high in limits:
+                visible[layers] |= (self.low[layers] < high) & (self.high[layers] > low)
 
-        _in_turn(look, range(0, len(visible), LAYERS), self.values.size)
+        _in_turn(look, len(visible), self.values.size)
         return visible
 
     def distance(self, task: Task) -> npt.NDArray[np.int32]:
@@ -199,64 +198,88 @@ class Bricks:
             matters = self.matters(task)
             distance = np.where(matters, 0, FARTHEST).astype(np.int32)
             if matters.any():
-                library, (layers, rows, _), size = (
-                    native.library(),
-                    distance.shape,
-                    self.values.size,
-                )
-                _find_distances(library.fhash_march_distance_layers, distance, layers, size)
-                _find_distances(library.fhash_march_distance_rows, distance, rows, size)
+                nearest(distance)
             distance.flags.writeable = False
             return distance
 
         return self.remembered("distance", task.visibility, compute)
 
 
-def _extremes(values: Single) -> tuple[Single, Single]:
+def _counts(values: Single) -> list[int]:
+    """Numbers of bricks along z, y and x."""
+    return [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
+
+
+def finite(low: Single, high: Single) -> bool:
+    """Whether bricks of these smallest and largest values have no infinite one."""
+    return not (np.isneginf(low).any() or np.isposinf(high).any())
+
+
+def extremes(values: Single) -> tuple[Single, Single]:
     """The smallest and the largest value of each brick, as the attributes of `Bricks` have them."""
-    bricks = [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
+    bricks = _counts(values)
     low, high = np.empty(bricks, dtype=np.float32), np.empty(bricks, dtype=np.float32)
     library = native.library()
     shape, counts = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*bricks)
+    assert values.strides[2] == values.itemsize
+    strides = (ctypes.c_int64 * 2)(*(stride // values.itemsize for stride in values.strides[:2]))
 
-    def layer(number: int) -> None:
+    def layers(first: int, stop: int) -> None:
         scratch = np.empty(2 * values.shape[2], dtype=np.float32)
         library.fhash_march_bricks(
             values.ctypes.data,
             shape,
+            strides,
             counts,
             SIDE,
-            number,
-            number + 1,
+            first,
+            stop,
             low.ctypes.data,
             high.ctypes.data,
             scratch.ctypes.data,
         )
 
-    _in_turn(layer, range(bricks[0]), values.size)
+    _in_turn(layers, bricks[0], values.size)
     return low, high
 
 
-def _find_distances(
-    function: Callable[..., object], distance: npt.NDArray[np.int32], count: int, vertices: int
-) -> None:
-    """Call one of the functions of march_bricks.cpp for distances with numbers 0 .. count - 1."""
-    shape = (ctypes.c_int64 * 3)(*distance.shape)
+def nearest(distance: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Put the distance from the nearest brick of 0 in place of larger numbers (z, y, x)."""
+    shape, library = (ctypes.c_int64 * 3)(*distance.shape), native.library()
+    layers, rows = library.fhash_march_distance_layers, library.fhash_march_distance_rows
+    for count, function in zip(distance.shape, (layers, rows), strict=False):
 
-    def find(number: int) -> None:
-        scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
-        function(shape, distance.ctypes.data, number, number + 1, scratch.ctypes.data)
+        def find(first: int, stop: int, function: Callable[..., object] = function) -> None:
+            scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
+            function(shape, distance.ctypes.data, first, stop, scratch.ctypes.data)
 
-    _in_turn(find, range(count), vertices)
+        _in_turn(find, count, distance.size * SIDE**3)
+    return distance
 
 
-def _in_turn(function: Callable[[int], object], numbers: range, vertices: int) -> None:
-    """Call a function with numbers: in several threads, if the frame has enough vertices."""
+CORNERS = tuple(product((0, 1), repeat=3))
+"""Corners (z, y, x) of a cell: 0 for the vertex before a place, 1 for the one after it."""
+
+
+def of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
+    """Reduce the eight vertices of each cell (z, y, x) by a function of two arrays.
+
+    An axis of one vertex has one cell.
+    """
+    for axis in range(3):
+        if values.shape[axis] > 1:
+            before = (slice(None),) * axis
+            values = reduce(values[(*before, slice(None, -1))], values[(*before, slice(1, None))])
+    return values
+
+
+def _in_turn(function: Callable[[int, int], object], count: int, vertices: int) -> None:
+    """Call a function with spans of 0 to `count`: in threads, if the frame has enough vertices."""
     if vertices < SMALL:
-        for number in numbers:
-            function(number)
+        function(0, count)
     else:
-        list(in_threads(function, numbers))
+        spans = [(first, min(first + LAYERS, count)) for first in range(0, count, LAYERS)]
+        list(in_threads(lambda span: function(*span), spans))
 
 
 REACH = 3.0
@@ -308,9 +331,14 @@ def smoothed(values: Single, deviation: float, error: float = math.inf) -> Singl
     return out
 
 
+def reach_of(deviation: float) -> int:
+    """Vertices that a Gaussian reaches on both sides."""
+    return math.ceil(REACH * deviation)
+
+
 def _weights(deviation: float) -> Single:
     """Weights of a value itself and of those 1, 2 and so on vertices away on both sides."""
-    away = np.arange(math.ceil(REACH * deviation) + 1)
+    away = np.arange(reach_of(deviation) + 1)
     weights = np.exp(-0.5 * (away / deviation) ** 2)
     return np.asarray(weights / (2 * weights.sum() - weights[0]), dtype=np.float32)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import math
 from ctypes import POINTER, c_double, c_float, c_int32, c_int64, c_uint32, c_void_p
 from dataclasses import dataclass
 from itertools import count, product
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, smoothed
+from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, reach_of, smoothed
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
 from fhash_codec.rendering.march_task import (
     GRADES,
@@ -27,6 +28,7 @@ from fhash_codec.rendering.march_task import (
     complete,
     extinctions_in,
 )
+from fhash_codec.rendering.tiled_frame import FETCH, Fetching, TiledFrame
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads, usable_threads
 from fhash_formats.support.values import Single
@@ -126,6 +128,8 @@ class March(ctypes.Structure):
         ("network_low", c_double),
         ("network_span", c_double),
         ("network_status", POINTER(c_int64)),
+        ("ready", POINTER(c_int32)),
+        ("fetch", FETCH),
     )
 
     def __init__(self, **fields: Any) -> None:
@@ -311,7 +315,7 @@ COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks", "evaluati
 
 def march_native(
     library: ctypes.CDLL,
-    frame: Frame,
+    frame: Frame | TiledFrame,
     task: Task,
     bricks: Bricks,
     threads: int | None = None,
@@ -324,17 +328,28 @@ def march_native(
     path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
     every processor has. The pictures agree within rounding.
     """
+    tiles = frame if isinstance(frame, TiledFrame) else None
+    frame = frame.frame if isinstance(frame, TiledFrame) else frame
     assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
     task = task.marched
-    given = MarchInput.of(frame, task, bricks)
-    (width, height), smooth = task.rays.size, _smooth(given, task, bricks)
+    given, fetching = MarchInput.of(frame, task, bricks), None
+    if tiles is not None and given.fields["values"] is bricks.values:
+        fetching = _fetching(given, task, tiles)
+        fields = fetching.fields
+    else:
+        if tiles is not None:
+            tiles.complete()  # scaled values are a copy
+            given = MarchInput.of(frame, task, bricks)
+        fields = _skipping_fields(library, given, task, bricks)
+        fields["smooth"] = _smooth(given, task, bricks)
+    width, height = task.rays.size
     rgba = np.zeros((height, width, 4), dtype=np.float32)
     # Normals need the depth, to keep that of the nearest of several rays.
     depth = np.full((height, width), np.inf, np.float32) if task.depth or task.normal else None
     normal = np.zeros((height, width, 3), dtype=np.float32) if task.normal else None
     structure = March(
         **given.fields,
-        **_skipping_fields(library, given, task, bricks),
+        **fields,
         **_table_fields(given, task),
         **_lighting_fields(task.lighting),
         **_grading_fields(given, task),
@@ -345,13 +360,14 @@ def march_native(
         step=task.step,
         threshold=task.threshold,
         jitter=task.jitter,
-        smooth=smooth,
         out=rgba,
         depth=depth,
         normal=normal,
         path=path,
     )
     counters = _march(library, structure, task, threads, progress)
+    if fetching is not None and fetching.error is not None:
+        raise fetching.error
     if frame.network is not None and given.fields["network_status"].any():
         raise MemoryError("not enough memory to evaluate points")
     return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal, counters=counters)
@@ -365,21 +381,14 @@ def _skipping_fields(
     They are the distances of `Bricks.distance`, the cells of `cells_of`, or the largest value of
     each brick for the maximum along a ray, the smallest times -1 for the minimum.
     """
-    if not task.skipping:
-        return {}
-    if task.projection in ("maximum", "minimum"):
-        # Scaled values have other extremes than the bricks.
-        if given.fields["values"] is not bricks.values:
-            return {}
+    by = _leaps_by(given, task)
+    if by == "highest" and given.fields["values"] is bricks.values:
         return {"highest": bricks.high if task.projection == "maximum" else -bricks.low}
-    shortest = float(np.abs(given.fields["spacing"]).min())
-    # A step longer than a brick could pass through one in which a surface lies, on its way from one
-    # in which nothing is visible to another.
-    if task.surfaces and task.step / shortest > SIDE:
+    if by != "distance":  # scaled values have other extremes than the bricks
         return {}
     distance = bricks.distance(task)
-    # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
-    by_cells = not (task.surfaces and task.step > 0.99 * shortest)
+    # No step may be longer than a cell, either. Rounding of places to float32 counts.
+    by_cells = not (task.surfaces and _longest_step(given, task) > 0.99)
     # The values of a network are not known before it is evaluated: any brick may show something.
     cells = (
         bricks.remembered(
@@ -391,6 +400,33 @@ def _skipping_fields(
     if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
         return {}
     return {"distance": distance, "cells": cells}
+
+
+def _longest_step(given: MarchInput, task: Task) -> float:
+    """The length of a step in vertices of the frame, where these lie nearest to each other."""
+    return task.step / float(np.abs(given.fields["spacing"]).min())
+
+
+def _leaps_by(given: MarchInput, task: Task) -> str:
+    """The name of the field that rays leap by, '' if they look at everything."""
+    # A step longer than a brick could pass through one in which a surface lies, on its way from one
+    # in which nothing is visible to another.
+    if not task.skipping or (task.surfaces and _longest_step(given, task) > SIDE):
+        return ""
+    return "highest" if task.projection in ("maximum", "minimum") else "distance"
+
+
+def _fetching(given: MarchInput, task: Task, tiles: TiledFrame) -> Fetching:
+    """The fields of a frame whose blocks are decoded when rays come to them."""
+    lighting, smoothing = task.lighting, None
+    margin = int(lighting is not None and lighting.central)
+    if given.smoothing and (task.shaded or task.surfaces):
+        smoothing = given.smoothing, given.error
+        margin = 1 + reach_of(given.smoothing)
+    if task.surfaces:  # one is looked for between places up to two steps from a sample
+        margin += math.ceil(2 * _longest_step(given, task))
+    by = _leaps_by(given, task)
+    return Fetching(tiles, task, margin=margin, by=by, smoothing=smoothing)
 
 
 def _table_fields(given: MarchInput, task: Task) -> dict[str, object]:
@@ -516,7 +552,7 @@ def _tiles(ends: npt.NDArray[np.float64], limits: tuple[int, int]) -> tuple[int,
 
 
 def march(
-    frame: Frame,
+    frame: Frame | TiledFrame,
     task: Task,
     *,
     bricks: Bricks | None = None,
@@ -535,7 +571,7 @@ def march(
     mean begins; the nearest one of several rays of a pixel.
 
     Args:
-        frame: the values.
+        frame: the values; those of a `TiledFrame` are decoded where rays reach them.
         task: what to march.
         bricks: of the frame; made if None.
         threads: most threads; None for all processors.
@@ -546,7 +582,7 @@ def march(
     if len(task.surfaces) > MAX_SURFACES:
         raise InputError(f"a picture has {len(task.surfaces)} surfaces; allowed: {MAX_SURFACES}")
     if bricks is None:
-        bricks = Bricks.of(frame)
+        bricks = frame.bricks if isinstance(frame, TiledFrame) else Bricks.of(frame)
     if task.projection and task.surfaces:
         surfaces = dataclasses.replace(task, projection="", table=None, shaded=False)
         projection = dataclasses.replace(task, surfaces=())

@@ -459,35 +459,45 @@ def warped(frame: Frame, warp: Warp | None) -> Frame:
     """
     if warp is None:
         return frame
-    values, first = frame.values, list(frame.first)
-    for axis, number in ((0, 2), (1, 1), (2, 0)):
-        places = warp.places[number]
-        if places is not None:
-            drawn = _drawn(places, frame, axis, warp.counts[number])
-            at = (
-                places[drawn.start : drawn.stop : frame.stride] - frame.first[axis]
-            ) / frame.stride
-            values = _resampled(values, np.clip(at, 0, values.shape[axis] - 1), axis)
-            first[axis] = drawn.start
-    return Frame(
-        values=np.ascontiguousarray(values),
-        first=(first[0], first[1], first[2]),
-        stride=frame.stride,
-    )
+    lattice = [
+        range(first, first + count * frame.stride, frame.stride)
+        for first, count in zip(frame.first, frame.values.shape, strict=True)
+    ]
+    drawn, places = zip(*drawn_places(lattice, frame.stride, warp), strict=True)
+    z, y, x = (along.start for along in drawn)
+    return replace(frame, values=resampled(frame.values, places, warp), first=(z, y, x))
 
 
-def _drawn(places: npt.NDArray[np.float64], frame: Frame, axis: int, count: int) -> range:
-    """The drawn vertices within a frame along an axis (0, 1, 2 for z, y, x), at least one.
+def drawn_places(
+    lattice: Sequence[range], stride: int, warp: Warp | None
+) -> Iterator[tuple[range, Double]]:
+    """The drawn vertices along z, y and x, and their places in numbers of the lattice's vertices.
 
-    A frame reaches to the end of the domain where no further vertex of it would fit.
+    At least one is drawn, and every `stride`-th of those that the lattice reaches. It reaches to
+    the end of the domain where no further vertex of it would fit.
+
+    lattice: vertices of the series.
     """
-    low = frame.first[axis]
-    end = low + frame.values.shape[axis] * frame.stride
-    high = count - 1 if end > count - 1 else end - frame.stride
-    begin = int(np.searchsorted(places, low - 1e-9, side="left"))
-    stop = int(np.searchsorted(places, high + 1e-9, side="right"))
-    begin = min(begin, len(places) - 1)
-    return range(begin, max(stop, begin + 1), frame.stride)
+    for own, number in zip(lattice, (2, 1, 0), strict=True):
+        places = None if warp is None else warp.places[number]
+        if warp is None or places is None:
+            yield own, np.arange(len(own), dtype=np.float64)
+            continue
+        low, last = own.start, warp.counts[number] - 1
+        high = last if own.stop > last else own[-1]
+        begin = min(int(np.searchsorted(places, low - 1e-9, side="left")), len(places) - 1)
+        stop = int(np.searchsorted(places, high + 1e-9, side="right"))
+        drawn = range(begin, max(stop, begin + 1), stride)
+        at = (places[drawn.start : drawn.stop : stride] - low) / stride
+        yield drawn, np.clip(at, 0, len(own) - 1)
+
+
+def resampled(values: Single, places: Sequence[Double], warp: Warp | None) -> Single:
+    """Values at places along z, y and x, in vertices of the values, where the axis is uneven."""
+    for axis, at in enumerate(places):
+        if warp is not None and warp.places[2 - axis] is not None:
+            values = _resampled(values, at, axis)
+    return np.ascontiguousarray(values)
 
 
 def _resampled(values: Single, at: npt.NDArray[np.float64], axis: int) -> Single:

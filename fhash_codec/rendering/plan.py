@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import MAX_LOD, Box
 from fhash_codec.devices import choose_device, may_have_cuda
+from fhash_codec.rendering.bricks import SIDE
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
 from fhash_codec.rendering.grid import Grid
@@ -24,8 +25,18 @@ from fhash_codec.rendering.light import (
     secondary_light,
     shading_of,
 )
-from fhash_codec.rendering.march_task import MAX_VALUES, NUMPY, Arrays, Surface, Table, Task, Units
+from fhash_codec.rendering.march_task import (
+    MAX_VALUES,
+    NUMPY,
+    Arrays,
+    Surface,
+    Table,
+    Task,
+    Units,
+    extinctions_in,
+)
 from fhash_codec.rendering.scenes import DEVICES, AmbientOcclusion, Effects, Scene, Shadows
+from fhash_codec.rendering.tiled_frame import block_sizes
 from fhash_codec.rendering.transfer_function import Histogram, TransferFunction, about
 from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
@@ -65,6 +76,8 @@ class Plan:
         step: of the series; fractional between two steps.
         time: physical time.
         mode: 'cache', 'arm' or 'stream'.
+        network: whether rays march through the published network.
+        streams: whether samples are streamed, not marched in packets of rays on a processor.
         why_mode: reason why 'auto' took the mode, for people; empty where the scene names it.
         lod: level of detail, 0 for the finest.
         why_lod: reason for the level, for people.
@@ -83,6 +96,8 @@ class Plan:
     step: float
     time: float
     mode: str
+    network: bool
+    streams: bool
     why_mode: str
     lod: int
     why_lod: str
@@ -98,6 +113,11 @@ class Plan:
     def lights(self) -> bool:
         """Whether light is computed before the rays are marched."""
         return self.shadows is not None or self.occlusion is not None
+
+    @property
+    def decodes_all(self) -> bool:
+        """Whether a frame of all that is in view is decoded before the rays are marched."""
+        return self.lights or (not self.network and (self.mode == "cache" or self.streams))
 
     def to_dict(self) -> dict[str, str]:
         """JSON values: the reasons by topic."""
@@ -213,24 +233,32 @@ def _time_text(plan: Plan) -> str:
 
 
 def _mode_text(plan: Plan, volume: Volume) -> str:
+    why = f", {plan.why_mode}" if plan.why_mode else ""
     if plan.mode == "cache":
-        why = f", {plan.why_mode}" if plan.why_mode else ""
         lattice = (
             "; linear between vertices, where the network (arm) has other values"
             if volume.profile == "paper"
             else ""
         )
         return f"cache: decode once, then march what was decoded{why}{lattice}"
-    through = "the network, which has values of its own between vertices (cache is linear there)"
-    if plan.why_mode:
-        through += f"; {plan.why_mode}"
-    if plan.mode == "stream":
-        return f"stream: one sample of each ray in a pass, straight through {through}"
-    if arrays_on(plan.scene.march.device) is NUMPY and plan.task.rays.grid.warp is None:
-        return f"arm: up to 16 samples of each ray at a time, straight through {through}"
+    if not plan.network and not plan.streams:
+        tiles = "all tiles, which light needs" if plan.lights else "a tile when a ray comes to it"
+        return f"arm: decode {tiles}{why}"
+    through = (
+        "straight through the network, which has values of its own between vertices (cache is "
+        "linear there)"
+        if plan.network
+        else "through a decoded frame"
+    )
     budget = plan.scene.march.samples_per_pass
-    samples = "as many samples as rays" if budget is None else f"{budget:,} samples"
-    return f"arm: {samples} in a pass, straight through {through}"
+    if plan.mode == "stream":
+        samples = "one sample of each ray in a pass"
+    elif not plan.streams:
+        samples = "up to 16 samples of each ray at a time"
+    else:
+        samples = f"{'as many' if budget is None else f'{budget:,}'} samples in a pass"
+        samples += " as rays" if budget is None else ""
+    return f"{plan.mode}: {samples}, {through}{why}"
 
 
 def _value_text(plan: Plan) -> str:
@@ -361,13 +389,20 @@ def plan_picture(
         task, error=error, grading=grading_of(scene.transfer_function, volume, units, grid)
     )
     _check_ray_length(task)
-    mode, why_mode = _mode(volume, scene)
     margin = _margin(task, lod)
     # Light comes from all of the volume, whether it is in view or not.
     domain = region_of_body(volume, task.body, grid.warp, margin)
     lit = shadows is not None or occlusion is not None
     region = domain if lit else region_in_view(rays, volume, task.body, margin)
-    if mode == "cache" or lit:
+    ends = not lit and _ends_rays(task) and _many_blocks(volume, region, lod)
+    mode, why_mode = _mode(volume, scene, ends)
+    network = volume.profile == "paper" and mode != "cache"
+    # In packets of rays march a processor's, but through networks on even axes alone.
+    streams = mode == "stream" or (
+        mode == "arm"
+        and ((network and grid.warp is not None) or arrays_of(volume, scene) is not NUMPY)
+    )
+    if lit or not network:
         _check_frame(region, lod)
     plan = Plan(
         scene=scene,
@@ -376,6 +411,8 @@ def plan_picture(
         step=step,
         time=_time_of(volume, step),
         mode=mode,
+        network=network,
+        streams=streams,
         why_mode=why_mode,
         lod=lod,
         why_lod=why_lod,
@@ -628,30 +665,50 @@ def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
         )
 
 
-def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
-    """The way to march, and why 'auto' took it; InputError for one that cannot be had."""
-    march = scene.march
-    if volume.profile != "paper":
-        if march.mode in ("arm", "stream") or march.device == "cuda":
-            what = "device 'cuda'" if march.device == "cuda" else f"march '{march.mode}'"
-            raise InputError(
-                f"{what} is for the published network, and {volume.path} holds another model: its "
-                "decoded frames are marched on the CPU; leave it out"
-            )
-        return "cache", "" if march.mode == "cache" else "since the file has no network"
-    if march.mode == "auto":
-        if march.device == "cuda" or (
-            march.device == "auto" and arrays_on(march.device) is not NUMPY
-        ):
-            return "arm", "chosen for the GPU"
-        if _few_samples(volume, scene):
-            return "arm", "chosen since so few samples cost less than decoding the frame"
-        return "cache", "as is fastest on a CPU"
+def _ends_rays(task: Task) -> bool:
+    """Whether rays end early: at an opaque surface, or where most colours are opaque in a brick."""
+    if task.projection:
+        return False
+    if any(surface.opacity >= 1 - task.threshold for surface in task.surfaces):
+        return True
+    if task.table is None:
+        return False
+    left = np.exp(-extinctions_in(task.table.extinctions, SIDE * task.rays.grid.vertex_spacing))
+    return bool(np.median(left) <= task.threshold)
+
+
+def _many_blocks(volume: Volume, region: Box, lod: int) -> bool:
+    """Whether a frame has as many blocks as two along each axis: fewer are seldom left out."""
+    sizes = block_sizes(volume, lod)
+    return math.prod(-(-n // size) for n, size in zip(region.shape, sizes, strict=True)) >= 8
+
+
+def _mode(volume: Volume, scene: Scene, ends: bool) -> tuple[str, str]:
+    """The way to march, and why 'auto' took it; InputError for one that cannot be had.
+
+    ends: whether rays end before they have seen most of a decoded frame.
+    """
+    march, network = scene.march, volume.profile == "paper"
     if march.mode == "cache" and march.device == "cuda":
         raise InputError(
             "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"
         )
-    return march.mode, ""
+    if march.mode != "auto":
+        return march.mode, ""
+    if march.device == "cuda" or (network and arrays_of(volume, scene) is not NUMPY):
+        return "arm", "chosen for the GPU"
+    if _few_samples(volume, scene):
+        return "arm", "chosen since so few samples cost less than decoding the frame"
+    if ends and not network:
+        return "arm", "chosen since rays end at what is opaque and need no tile behind it"
+    return "cache", "as is fastest on a CPU" + ("" if network else " where rays need most tiles")
+
+
+def arrays_of(volume: Volume, scene: Scene) -> Arrays:
+    """The arrays that samples are streamed in: on a GPU a network's, and others if it is named."""
+    device = scene.march.device
+    decoded = volume.profile != "paper" and device == "auto"
+    return arrays_on("cpu" if decoded else device)
 
 
 def _few_samples(volume: Volume, scene: Scene) -> bool:

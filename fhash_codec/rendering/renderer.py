@@ -15,18 +15,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.boxes import Box
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.image import Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.march_task import Frame, Marched, Task, Units, complete, warped
-from fhash_codec.rendering.plan import Plan, arrays_on, plan_at, plan_picture
+from fhash_codec.rendering.march_task import Marched, Task, complete
+from fhash_codec.rendering.plan import Plan, arrays_of, plan_at, plan_picture
 from fhash_codec.rendering.scenes import MAX_SIDE, Scene
 from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField
 from fhash_codec.rendering.stream_march import stream
+from fhash_codec.rendering.tiled_frame import FrameField, TiledFrame
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_codec.volume import Volume, only_features
 from fhash_formats.errors import FhashError, InputError
@@ -163,27 +162,6 @@ GLANCE = 2**15
 """Most vertices of a frame that is read to look at it: 32 along each axis show its shape."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _DecodedFrame:
-    """A decoded frame, the region (z, y, x) that was asked for, and the frame's bricks."""
-
-    frame: Frame
-    region: Box
-    bricks: Bricks
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the values."""
-        return self.frame.values.nbytes
-
-    def covers(self, region: Box) -> bool:
-        """Whether the frame was decoded for this region or a larger one."""
-        return all(
-            low <= first and last <= high
-            for (low, high), (first, last) in zip(self.region, region, strict=True)
-        )
-
-
 class Renderer:
     """Renders pictures of one volume and keeps decoded frames for the next pictures.
 
@@ -202,12 +180,12 @@ class Renderer:
         self.volume, self.memory, self.threads = volume, memory, threads
         self._whole = volume
         self._features: tuple[str, ...] = ()
-        self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
+        self._frames: OrderedDict[Key, TiledFrame] = OrderedDict()
         self._histogram: Histogram | None = None
         self._last_plan: tuple[Scene, Plan] | None = None
         self._fullest: tuple[Any, int] | None = None
         self._background: ThreadPoolExecutor | None = None
-        self._prefetch: tuple[Key, Future[_DecodedFrame]] | None = None
+        self._prefetch: tuple[Key, Future[TiledFrame]] | None = None
         self._process = os.getpid()
 
     def plan(self, scene: Scene) -> Plan:
@@ -270,18 +248,20 @@ class Renderer:
         if plan is None:
             plan = self.plan(Scene() if scene is None else scene)
         self._choose(plan.scene.features)
-        # Networks are evaluated where rays sample them; light needs a frame all the same.
-        frame_needed = plan.mode == "cache" or plan.lights
-        decoded = self._frame(plan, progress) if frame_needed else None
-        if upcoming is not None:
+        decoded = self._frame(plan, progress) if plan.lights or not plan.network else None
+        if upcoming is not None and plan.decodes_all:  # else the march reads the volume
             self._start_prefetch(upcoming)
         task, secondary_rays = _lit(plan, decoded, progress)
         progress("marching", 0, 1, "")
-        marched = self._march(plan, task, decoded, progress)
+        if plan.network:
+            marched = self._march_network(plan, task, progress)
+        else:
+            assert decoded is not None
+            marched = self._march_frame(plan, task, decoded, progress)
         progress("marching", 1, 1, "")
         more = {
             "secondary_rays": secondary_rays,
-            "decoded_vertices": 0 if decoded is None else decoded.frame.values.size,
+            "decoded_vertices": 0 if decoded is None else decoded.vertices,
         }
         return self._finish(plan, marched, more, begin)
 
@@ -301,25 +281,33 @@ class Renderer:
             self._histogram = _histogram_of(self.volume)
         return self._histogram
 
-    def _march(
-        self, plan: Plan, task: Task, decoded: _DecodedFrame | None, progress: Progress
+    def _march_frame(
+        self, plan: Plan, task: Task, tiles: TiledFrame, progress: Progress
     ) -> Marched:
-        """March the rays of a task in the mode of the plan."""
-        if plan.mode == "cache":
-            assert decoded is not None
-            return march(
-                decoded.frame,
-                task,
-                bricks=decoded.bricks,
-                threads=self.threads,
-                progress=progress,
-            )
-        arrays = arrays_on(plan.scene.march.device)
+        """March the rays of a task through a decoded frame."""
+        frame, bricks = tiles.frame, tiles.bricks
+        if not plan.streams:
+            source = frame if tiles.decoded.all() else tiles
+            return march(source, task, bricks=bricks, threads=self.threads, progress=progress)
+        arrays = arrays_of(self.volume, plan.scene)
+        marched = stream(
+            FrameField(frame, bricks, task.rays.grid, arrays),
+            task,
+            adaptive=plan.mode == "arm",
+            budget=plan.scene.march.samples_per_pass,
+            progress=progress,
+        )
+        # Looking up decoded values is not an evaluation of a network.
+        return replace(marched, counters={**marched.counters, "evaluations": 0})
+
+    def _march_network(self, plan: Plan, task: Task, progress: Progress) -> Marched:
+        """March the rays of a task through the published network."""
+        arrays = arrays_of(self.volume, plan.scene)
         network = NetworkField(self.volume, plan.step, plan.units, arrays)
         field: Field = network
         if task.rays.grid.warp is not None:
             field = WarpedField(field, task.rays.grid.warp)
-        elif plan.mode == "arm" and (frame := network.frame) is not None:
+        elif not plan.streams and (frame := network.frame) is not None:
             bricks, threads = network.bricks, self.threads
             return march(frame, task, bricks=bricks, threads=threads, progress=progress)
         return stream(
@@ -363,10 +351,14 @@ class Renderer:
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
 
-    def _frame(self, plan: Plan, progress: Progress) -> _DecodedFrame:
+    def _frame(self, plan: Plan, progress: Progress) -> TiledFrame:
         """The decoded frame of a plan: a cached one, the prefetched one, or a new one."""
         cached = self._cached(plan)
         if cached is not None:
+            if not cached.decoded.all():
+                self._finish_prefetch()  # now the volume is read here
+                if plan.decodes_all:
+                    cached.complete()
             return cached
         key = plan.step, plan.lod
         progress("decoding", 0, 1, "")
@@ -377,7 +369,7 @@ class Renderer:
         self._cache(key, decoded)
         return decoded
 
-    def _cached(self, plan: Plan) -> _DecodedFrame | None:
+    def _cached(self, plan: Plan) -> TiledFrame | None:
         """The cached frame of a plan, if it covers the plan's region."""
         key = plan.step, plan.lod
         cached = self._frames.get(key)
@@ -386,7 +378,7 @@ class Renderer:
         self._frames.move_to_end(key)
         return cached
 
-    def _cache(self, key: Key, decoded: _DecodedFrame) -> None:
+    def _cache(self, key: Key, decoded: TiledFrame) -> None:
         """Keep a frame, and drop the least recently used ones beyond the memory."""
         self._frames.pop(key, None)
         while (
@@ -406,7 +398,7 @@ class Renderer:
             plan = self.plan(scene)
         except (FhashError, OSError):
             return
-        if plan.mode != "cache" or self._cached(plan) is not None:
+        if not plan.decodes_all or self._cached(plan) is not None:
             return
         self._finish_prefetch()
         if self._background is None:
@@ -414,7 +406,7 @@ class Renderer:
         future = self._background.submit(_decode, self.volume, plan)
         self._prefetch = (plan.step, plan.lod), future
 
-    def _finish_prefetch(self, key: Key | None = None) -> _DecodedFrame | None:
+    def _finish_prefetch(self, key: Key | None = None) -> TiledFrame | None:
         """Wait for the prefetched frame; return it if it has this key.
 
         The wait is needed in any case: only one thread at a time may read a volume.
@@ -442,7 +434,7 @@ def _in_picture(
     return whole
 
 
-def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple[Task, int]:
+def _lit(plan: Plan, decoded: TiledFrame | None, progress: Progress) -> tuple[Task, int]:
     """The task of a plan with its light, and the number of secondary rays that the light took."""
     if not plan.lights:
         return plan.task, 0
@@ -529,43 +521,13 @@ def _histogram_of(volume: Volume) -> Histogram:
     return edges / scale, counts
 
 
-def _decode(volume: Volume, plan: Plan) -> _DecodedFrame:
-    frame = warped(
-        decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units),
-        plan.task.rays.grid.warp,
+def _decode(volume: Volume, plan: Plan) -> TiledFrame:
+    return TiledFrame(
+        volume,
+        plan.step,
+        plan.lod,
+        plan.region,
+        units=plan.units,
+        warp=plan.task.rays.grid.warp,
+        whole=plan.decodes_all,
     )
-    return _DecodedFrame(frame=frame, region=plan.region, bricks=Bricks.of(frame))
-
-
-def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:
-    """Decode a region of the feature bounding box as a marcher takes it.
-
-    Args:
-        volume: an open container.
-        step: of the series; fractional between two steps.
-        lod: level of detail; every 2^lod-th vertex along each axis is decoded.
-        region: (z, y, x) of the domain; only its part within the feature bounding box is decoded.
-        units: of the values of the frame.
-    """
-    inner: Box = tuple(  # type: ignore[assignment]
-        (max(low, first), min(high, last))
-        for (low, high), (first, last) in zip(region, volume.box, strict=True)
-    )
-    if any(low >= high for low, high in inner):
-        # Nothing of the feature is in the picture: one vertex without a value stands for it.
-        low, _ = zip(*volume.box, strict=True)
-        return Frame(
-            values=np.full((1, 1, 1), np.nan, dtype=np.float32),
-            first=(low[0], low[1], low[2]),
-            stride=1 << lod,
-        )
-    if lod == 0:
-        values, first = volume.read(step, inner), [low for low, _ in inner]
-    else:
-        first = [vertices.start for vertices in volume.lod_vertices(lod, inner)]
-        before, after = int(np.floor(step)), int(np.ceil(step))
-        values = volume.read_lod(before, lod, inner)
-        if after != before:
-            share = volume.key_times.key_index(step) - volume.key_times.key_index(before)
-            values = values * (1 - share) + volume.read_lod(after, lod, inner) * share
-    return Frame(values=units.single(values), first=(first[0], first[1], first[2]), stride=1 << lod)

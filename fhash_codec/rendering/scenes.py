@@ -93,7 +93,7 @@ VIEWS = ("auto", "iso", "xy", "xz", "yz", "yx", "zx", "zy")
 """Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards.
 `auto` is `iso`, but from above for a volume with an axis of one vertex."""
 MARCHES = ("auto", "cache", "arm", "stream")
-"""Names of the ways to march: through a decoded frame, or straight through the model."""
+"""Names of the ways to march: through a frame decoded at once, or as rays or samples need it."""
 DEVICES = ("auto", "cpu", "cuda")
 """Names of the devices that rays are marched on."""
 BUFFERS = ("depth", "normal")
@@ -349,8 +349,8 @@ class Marching(Record):
 
     mode: str = limits(
         "auto",
-        "way to march: decoded frames from the cache, or a network adaptively (arm) or sample by "
-        "sample (stream)",
+        "way to march: decoded frames from the cache, or adaptively (arm), where tiles are decoded "
+        "and networks evaluated as rays come to them, or sample by sample (stream)",
         choices=MARCHES,
     )
     step: float = limits(0.5, "length of a step in vertex spacings", low=1e-6, high=64)
@@ -365,14 +365,15 @@ class Marching(Record):
     )
     samples_per_pass: int | None = limits(
         None,
-        "N_r of adaptive ray marching on a GPU, and on uneven axes: samples in a pass; the number "
-        "of rays if left out",
+        "N_r of adaptive ray marching in passes, on a GPU and through networks on uneven axes: "
+        "samples in a pass; the number of rays if left out",
         low=1,
         high=2**40,
     )
     device: str = limits(
         "auto",
-        "where a network is marched (arm, stream): on the first GPU if there is one, or as named",
+        "where arm and stream march: as named, or networks on the first GPU if there is one and "
+        "decoded frames on the CPU",
         choices=DEVICES,
     )
     skipping: bool = limits(True, "whether bricks without anything visible are passed over")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -12,7 +10,7 @@ import numpy.typing as npt
 
 from fhash_codec.paper.model import PaperModel, PointSampler, PointTables
 from fhash_codec.paper.network import Network
-from fhash_codec.rendering.bricks import SIDE, Bricks, Palette
+from fhash_codec.rendering.bricks import CORNERS, SIDE, Bricks, Palette, of_cells
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Warp
 from fhash_codec.rendering.march_task import (
@@ -84,10 +82,6 @@ class HostInference:
         return values
 
 
-CORNERS = tuple(product((0, 1), repeat=3))
-"""Corners (z, y, x) of a cell: 0 for the vertex before a place, 1 for the one after it."""
-
-
 class Field(Protocol):
     """Values anywhere in the domain, in arrays of `arrays`.
 
@@ -119,6 +113,11 @@ class Field(Protocol):
         """The place (3,), x, y, z, at which the first brick and the first cell begin."""
         ...
 
+    @property
+    def stride(self) -> int:
+        """Vertices of the domain along the side of a cell."""
+        ...
+
     def visible(self, palette: Palette) -> Array:
         """Cells (z, y, x), the first at `first`, in which a sample could have an opacity.
 
@@ -138,28 +137,36 @@ class Field(Protocol):
         """Derivatives by x, y and z per vertex, float64 (n, 3), 0 where there are none."""
         ...
 
+    def smoothed(self, deviation: float, error: float) -> Field | None:
+        """The field that shades where the noise of coding is smoothed; None where nothing is.
 
-def central_slopes(field: Field, places: Array) -> Array:
+        deviation: of a Gaussian, in vertices. error: largest difference of a smoothed value.
+        """
+        ...
+
+
+def central_slopes(field: Field, places: Array, own: Field) -> Array:
     """Slopes (n, 3) at places (n, 3) by central differences.
 
     They are over one vertex before and behind along each axis, clamped to those of the field. Where
-    one of the two has no value, the field's own slope along that axis stands.
+    one of the two has no value, the slope of `own` along that axis stands.
     """
     arrays, xp, (low, high) = field.arrays, field.arrays.xp, field.vertices.T
+    away = float(field.stride)
     slopes = arrays.empty((len(places), 3))
     for axis in range(3):
         ends = []
-        for offset in (-1.0, 1.0):
+        for offset in (-away, away):
             moved = arrays.copy(places)
             moved[:, axis] = xp.clip(
                 xp.clip(places[:, axis], low[axis], high[axis]) + offset, low[axis], high[axis]
             )
             ends.append(field.values(moved))
-        slopes[:, axis] = (ends[1] - ends[0]) / 2
+        slopes[:, axis] = (ends[1] - ends[0]) / (2 * away)
     (missing,) = arrays.nonzero(xp.any(xp.isnan(slopes), axis=1))
     if len(missing):
         slopes[missing] = xp.where(
-            xp.isnan(slopes[missing]), field.slopes(places[missing]), slopes[missing]
+            xp.isnan(slopes[missing]), own.slopes(places[missing]), slopes[missing]
         )
     return slopes
 
@@ -170,6 +177,8 @@ class CoresetField:
     A place has a value where all vertices of weight around it are in the coreset. Which one is not
     known before the field is evaluated: any value of the range, with a margin.
     """
+
+    stride = 1
 
     def __init__(
         self,
@@ -203,7 +212,10 @@ class CoresetField:
 
     def visible(self, palette: Palette) -> Array:
         """Cells with a vertex of the coreset: their values are not known before evaluation."""
-        return _of_cells(self._in_coreset, self.arrays.xp.logical_or)
+        return of_cells(self._in_coreset, self.arrays.xp.logical_or)
+
+    def smoothed(self, deviation: float, error: float) -> None:
+        """Nothing: networks are smooth."""
 
     def inside(self, places: Array) -> tuple[Array, Array]:
         """Places (n, 3) in vertices of the box, clipped to it, and whether they have a value."""
@@ -286,23 +298,13 @@ def _possible(in_coreset: npt.NDArray[np.bool_], low: float, high: float) -> Bri
         Frame(values=np.where(in_coreset, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
     )
     has_value = bricks.low <= bricks.high
+    low, high = (float(np.float32(end)) for end in (2 * low - high, 2 * high - low))
     return replace(
         bricks,
-        low=np.where(has_value, np.float32(2 * low - high), np.float32(np.inf)),
-        high=np.where(has_value, np.float32(2 * high - low), np.float32(-np.inf)),
+        low=np.where(has_value, np.float32(low), np.float32(np.inf)),
+        high=np.where(has_value, np.float32(high), np.float32(-np.inf)),
+        value_range=(low, high) if has_value.any() else (0.0, 0.0),
     )
-
-
-def _of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
-    """Reduce the eight vertices of each cell (z, y, x) by a function of two arrays.
-
-    An axis of one vertex has one cell.
-    """
-    for axis in range(3):
-        if values.shape[axis] > 1:
-            before = (slice(None),) * axis
-            values = reduce(values[(*before, slice(None, -1))], values[(*before, slice(1, None))])
-    return values
 
 
 class WarpedField:
@@ -310,6 +312,8 @@ class WarpedField:
 
     Between two drawn vertices places run linearly. Bricks and cells take in all that they touch.
     """
+
+    stride = 1
 
     def __init__(self, field: Field, warp: Warp) -> None:
         """Stand between a marcher and a field."""
@@ -385,6 +389,10 @@ class WarpedField:
         """Derivatives (n, 3) by x, y and z per drawn vertex, 0 where there are none."""
         moved, rates = self._moved(places)
         return self._field.slopes(moved) * rates
+
+    def smoothed(self, deviation: float, error: float) -> Field | None:
+        """Nothing: networks, which alone are warped here, are smooth."""
+        return None
 
     def _moved(self, places: Array) -> tuple[Array, Array]:
         """Places (n, 3) in vertices of the series, and vertices of it per drawn vertex (n, 3)."""
@@ -649,19 +657,19 @@ class Leaping:
     side: float
 
     @classmethod
-    def of(cls, bricks: Bricks, task: Task, first: Array, arrays: Arrays) -> Leaping:
+    def of(cls, field: Field, task: Task) -> Leaping:
         """Leaping for a task: over bricks without a visible value and without a surface.
 
         task: with the table that samples take.
         """
-        distance = bricks.distance(task)
+        arrays, distance = field.arrays, field.bricks.distance(task)
         last = arrays.array(np.array(distance.shape[::-1]) - 1.0)
         return cls(
             arrays=arrays,
             distance=arrays.array(distance, "int64"),
             last=last,
-            first=first,
-            side=float(SIDE),
+            first=field.first,
+            side=float(SIDE * field.stride),
         )
 
     def matters(self, places: Array) -> Array:
@@ -745,7 +753,9 @@ class Factors:
         """Factors (n,) of the extinction at places (n, 3) of the domain."""
         xp = self._arrays.xp
         slopes = (
-            central_slopes(self._field, places) if self._central else self._field.slopes(places)
+            central_slopes(self._field, places, self._field)
+            if self._central
+            else self._field.slopes(places)
         ) / self._spacing
         entry = xp.clip(xp.sqrt(xp.sum(slopes * slopes, axis=1)) * self._scale, 0.0, float(GRADES))
         before = self._arrays.to_int64(entry)

@@ -23,7 +23,7 @@ import numpy as np
 
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import SIDE, Palette
-from fhash_codec.rendering.light import flatness, slope_scale
+from fhash_codec.rendering.light import flatness, slope_scale, smoothing
 from fhash_codec.rendering.march_task import (
     Array,
     Arrays,
@@ -128,10 +128,11 @@ class _Marcher:
         self.field, self.task, self.beams, self.arrays = field, task, beams, arrays
         self.palette = None if task.table is None else Palette.of(task.table, arrays)
         self.canvas = Canvas(field, task, beams, self.palette)
-        self.leaping = Leaping.of(field.bricks, task, field.first, arrays)
+        self.leaping = Leaping.of(field, task)
         # A step longer than a brick could pass through one in which a surface lies, on its way from
         # one in which nothing is visible to another.
-        short = task.step <= SIDE * float(np.min(np.abs(task.rays.grid.spacing)))
+        shortest = field.stride * float(np.min(np.abs(task.rays.grid.spacing)))
+        short = task.step <= SIDE * shortest
         self.skipping = task.skipping and (short or not task.surfaces)
         # Between two samples in cells without a surface there may be a cell with one: pictures with
         # surfaces look at whole bricks.
@@ -247,7 +248,7 @@ class _Marcher:
         """Whether places (n, 3) lie in visible cells."""
         assert self.cells is not None
         z, y, x = self.cells.shape
-        at = self.arrays.to_int64(places - self.field.first)
+        at = self.arrays.to_int64((places - self.field.first) / self.field.stride)
         i, j, k = (
             self.arrays.xp.clip(at[:, axis], 0, size - 1) for axis, size in enumerate((x, y, z))
         )
@@ -680,8 +681,8 @@ class Phong:
             of the table's range per vertex spacing.
         floor: gradient at which the light from a direction has faded by half, so that the noise of
             rounding is not lit.
-        field: whose gradients are taken.
-        central: whether by central differences.
+        field: whose gradients are taken where `differences` is None or has none.
+        differences: the field whose central differences are taken.
     """
 
     arrays: Arrays
@@ -690,7 +691,7 @@ class Phong:
     scale: Array
     floor: float
     field: Field
-    central: bool
+    differences: Field | None
 
     @classmethod
     def of(cls, task: Task, field: Field) -> Phong | None:
@@ -701,6 +702,8 @@ class Phong:
         least, most = field.bricks.value_range
         low, high = (least, most) if task.table is None else (task.table.low, task.table.high)
         span, floor = flatness(low, high, least, most, task.noise)
+        deviation = smoothing(span, task.noise)
+        smooth = field.smoothed(deviation, task.error) if deviation else None
         return cls(
             arrays=arrays,
             lighting=lighting,
@@ -708,12 +711,14 @@ class Phong:
             scale=arrays.array(slope_scale(task.rays.grid, span, least, most)),
             floor=floor,
             field=field,
-            central=lighting.central,
+            differences=smooth or (field if lighting.central else None),
         )
 
     def slopes(self, places: Array) -> Array:
         """Derivatives (n, 3) by x, y and z per vertex, for shading."""
-        return central_slopes(self.field, places) if self.central else self.field.slopes(places)
+        if self.differences is None:
+            return self.field.slopes(places)
+        return central_slopes(self.differences, places, self.field)
 
     def __call__(
         self, colours: Array, slopes: Array, along: Array, lamp: Array, around: Array

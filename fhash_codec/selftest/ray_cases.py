@@ -13,8 +13,9 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Task, warped
 from fhash_codec.rendering.plan import Plan, plan_picture
-from fhash_codec.rendering.renderer import Renderer, decoded_frame
+from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import Scene
+from fhash_codec.rendering.tiled_frame import decoded_frame
 from fhash_codec.selftest.case import Case, Check, Finding, Run
 from fhash_codec.selftest.field_cases import Settings, Shape, series, single, waves
 from fhash_formats.series import ArraySeries

@@ -61,7 +61,7 @@ def orbit(turns: int, size: int, side: int | None = None) -> tuple[Switch, ...]:
         pictures: list[Marched] = []
         march(frame, tasks[0], bricks=kept)
         for task in tasks:
-            fresh = Bricks(values=kept.values, low=kept.low, high=kept.high)
+            fresh = Bricks.of(frame)
             for bricks, times in ((fresh, anew), (kept, again)):
                 begun = time.perf_counter()
                 pictures.append(march(frame, task, bricks=bricks))

@@ -1,28 +1,25 @@
-"""A small series as a file, of all of it, of a feature and of a network, for pictures."""
+"""A small series as a file, of all of it, of a feature and of a network; frames and their tasks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
-from frame_field import by_stream
+from frame_field import blobs, by_stream, field_of, frame_of, table_of, task_of
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.rendering.image import Image
-from fhash_codec.rendering.march_task import Arrays
-
-SHAPE = (3, 20, 24, 28)
-
-
-def blobs() -> np.ndarray:
-    """Two blobs that move apart, (t, z, y, x) float32, about 0 .. 10."""
-    t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
-    first = 9 * np.exp(-((z - 9) ** 2 + (y - 10) ** 2 + (x - 9 + 2 * t) ** 2) / 14)
-    second = 7 * np.exp(-((z - 12) ** 2 + (y - 14) ** 2 + (x - 19 - 2 * t) ** 2) / 10)
-    return (first + second + 0.05 * np.sin(x / 3)).astype(np.float32)
+from fhash_codec.rendering.light import light_grid
+from fhash_codec.rendering.march_task import Arrays, Lighting, Surface, Task
+from fhash_codec.rendering.scenes import Camera
+from fhash_codec.rendering.stream_fields import Field, NetworkField
+from fhash_codec.rendering.tiled_frame import FrameField, decoded_frame
 
 
 @pytest.fixture(params=["native", "streamed"])
@@ -83,6 +80,58 @@ def tensors() -> Arrays:
     from fhash_codec.rendering.torch_arrays import TorchArrays
 
     return TorchArrays(torch.device("cpu"))
+
+
+@pytest.fixture
+def frame_task() -> Callable[..., tuple[FrameField, Task]]:
+    """A function that gives a field of values and a task of 8 x 8 parallel rays along z.
+
+    fog: extinction everywhere. surfaces: lit by ambient light alone.
+    """
+
+    def of(
+        values: npt.NDArray[Any],
+        *,
+        step: float = 0.5,
+        surfaces: tuple[Surface, ...] = (),
+        fog: float = 0.0,
+    ) -> tuple[FrameField, Task]:
+        ambient = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0, lamp=None)
+        task = task_of(
+            values.shape,
+            table_of([fog, fog]) if fog else None,
+            camera=Camera(view="xy", projection="parallel", parallel_scale=2.0),
+            step=step,
+            surfaces=surfaces,
+            lighting=ambient if surfaces else None,
+        )
+        return field_of(frame_of(values), task.rays.grid), task
+
+    return of
+
+
+@pytest.fixture
+def planned() -> Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]:
+    """A function that gives a scene's task and the field for it, in arrays of one kind."""
+
+    def of(volume: Volume, scene: dict[str, Any], arrays: Arrays) -> tuple[Field, Task]:
+        plan = Renderer(volume).plan(
+            Scene.from_dict(
+                {"size": [40, 34], **scene, "march": {"lod": 0, **scene.get("march", {})}}
+            )
+        )
+        task, grid = plan.task, plan.task.rays.grid
+        if volume.profile == "paper":
+            return NetworkField(volume, plan.step, plan.units, arrays), task
+        frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
+        if plan.lights:
+            light = light_grid(
+                frame, task, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion
+            )
+            task = replace(task, light=light)
+        return field_of(frame, grid, arrays), task
+
+    return of
 
 
 class Drawing:

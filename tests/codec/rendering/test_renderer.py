@@ -20,8 +20,7 @@ from rarely import rarely
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.rendering import render
-from fhash_codec.rendering import renderer as module
+from fhash_codec.rendering import render, tiled_frame
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import named_map
 from fhash_codec.rendering.grid import Grid
@@ -137,13 +136,13 @@ def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The steps that renderers decode, in order."""
     steps: list[float] = []
-    original = module.decoded_frame
+    original = tiled_frame.decoded_frame
 
     def noted(volume: Volume, step: float, *others: Any) -> Any:
         steps.append(step)
         return original(volume, step, *others)
 
-    monkeypatch.setattr(module, "decoded_frame", noted)
+    monkeypatch.setattr(tiled_frame, "decoded_frame", noted)
     return steps
 
 
@@ -158,13 +157,13 @@ def test_what_was_decoded_is_kept(renderer: Renderer, decoded: list[float]) -> N
 
 def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
     decoded: list[tuple[float, bool]] = []
-    original = module.decoded_frame
+    original = tiled_frame.decoded_frame
 
     def counted(volume: Volume, step: float, *others: Any) -> Any:
         decoded.append((step, threading.current_thread() is threading.main_thread()))
         return original(volume, step, *others)
 
-    monkeypatch.setattr(module, "decoded_frame", counted)
+    monkeypatch.setattr(tiled_frame, "decoded_frame", counted)
     renderer, alone = Renderer(volume), Renderer(volume)
     shown = [scene(step=step) for step in (0, 1, 2)]
     for current, following in zip(shown, [*shown[1:], None], strict=True):
@@ -230,9 +229,9 @@ def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
 
 
 def test_a_step_between_is_the_mean_of_values(volume: Volume) -> None:
-    frame = module.decoded_frame(volume, 0.5, 0, ((0, 20), (0, 24), (0, 28)), Units())
+    frame = tiled_frame.decoded_frame(volume, 0.5, 0, ((0, 20), (0, 24), (0, 28)), Units())
     np.testing.assert_allclose(frame.values, (volume.read(0) + volume.read(1)) / 2, atol=1e-5)
-    coarse = module.decoded_frame(volume, 0.5, 1, ((0, 20), (0, 24), (0, 28)), Units())
+    coarse = tiled_frame.decoded_frame(volume, 0.5, 1, ((0, 20), (0, 24), (0, 28)), Units())
     np.testing.assert_allclose(
         coarse.values, (volume.read_lod(0, 1) + volume.read_lod(1, 1)) / 2, atol=1e-5
     )
@@ -241,7 +240,7 @@ def test_a_step_between_is_the_mean_of_values(volume: Volume) -> None:
 
 def test_what_lies_outside_the_coreset_is_not_seen(files: dict[str, Path]) -> None:
     with fhash_codec.open(files["feature"]) as volume:
-        frame = module.decoded_frame(volume, 0.0, 0, ((0, 20), (0, 24), (0, 28)), Units())
+        frame = tiled_frame.decoded_frame(volume, 0.0, 0, ((0, 20), (0, 24), (0, 28)), Units())
         assert np.isnan(frame.values).any()
         assert frame.first == tuple(low for low, _ in volume.box)
         image = fhash_codec.render(volume, scene(transfer_function={"opacity": "opaque"}))

@@ -69,7 +69,8 @@ void make_bricks(Reader& in, Switches flags, FhashMarch& m, Arrays& arrays) {
     arrays.lowest.resize(static_cast<std::size_t>(bricks));
     arrays.highest.resize(arrays.lowest.size());
     arrays.scratch.resize(static_cast<std::size_t>(2 * m.shape[2]));
-    fhash_march_bricks(m.values, m.shape, m.bricks, FHASH_BRICK, 0, m.bricks[0],
+    const int64_t strides[] = {m.shape[1] * m.shape[2], m.shape[2]};
+    fhash_march_bricks(m.values, m.shape, strides, m.bricks, FHASH_BRICK, 0, m.bricks[0],
                        arrays.lowest.data(), arrays.highest.data(), arrays.scratch.data());
     arrays.distance.resize(arrays.lowest.size());
     const std::vector<std::uint8_t> matters = repeated<std::uint8_t>(in, bricks);
@@ -211,6 +212,18 @@ int64_t stand_in(const int64_t*, const int64_t*, const int64_t*, const int64_t* 
     return 0;
 }
 
+// Bricks of a frame that is decoded while it is marched, and how many may be fetched.
+std::vector<std::int32_t> ready;
+int64_t fetches;
+
+int64_t fetch(int64_t brick) {
+    require(brick >= 0 && brick < static_cast<int64_t>(ready.size()), "a brick beyond the frame");
+    require(!ready[static_cast<std::size_t>(brick)], "a brick that is there is fetched again");
+    if (fetches-- <= 0) return 1;
+    ready[static_cast<std::size_t>(brick)] = 1;
+    return 0;
+}
+
 }  // namespace
 
 void march(Reader& in) {
@@ -237,6 +250,13 @@ void march(Reader& in) {
         m.network_span = (double)(m.entries - 1) / m.scale;
         m.network_whole = in.within(0, 1);
         m.network_status = &status;
+    }
+    if (in.within(0, 1)) {
+        ready = repeated<std::int32_t>(in, m.bricks[0] * m.bricks[1] * m.bricks[2]);
+        for (std::int32_t& one : ready) one &= 1;
+        fetches = in.byte();
+        m.ready = ready.data();
+        m.fetch = fetch;
     }
     int64_t counters[6] = {};
     fhash_march(&m, effects, 0, ((m.width + 15) / 16) * ((m.height + 15) / 16), counters);

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from frame_field import CENTRAL, NETWORK_SCENES, SCENES, FrameField
+from frame_field import CENTRAL, NETWORK_SCENES, SCENES, field_of
 from rarely import rarely
 
 import fhash_codec
@@ -43,6 +43,7 @@ from fhash_codec.rendering.stream_fields import (
     shares,
 )
 from fhash_codec.rendering.stream_march import Canvas, Events, stream
+from fhash_codec.rendering.tiled_frame import FrameField
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
 
@@ -73,7 +74,7 @@ def test_a_leap_ends_at_the_first_sample_in_a_brick_that_matters(frame_task: Fra
     surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
     field, task = frame_task(values, step=0.4, surfaces=(surface,))
     beams = Beams.of(task, field.bounds, range(8))
-    leaping = Leaping.of(field.bricks, task, field.first, NUMPY)
+    leaping = Leaping.of(field, task)
     rays, every_ray = np.arange(64), np.ones(64, dtype=bool)
     reached, leaps = leaping.leap(beams.origin, beams.pace, beams.begin, beams.end, every_ray)
     every = np.arange(beams.end.max())[None]
@@ -436,13 +437,15 @@ def test_central_differences_reach_one_vertex_to_both_sides(frame_task: FrameTas
     field, _ = frame_task(values)
     values = values.astype(np.float32)
     inner = field.arrays.array([[3.0, 2.0, 5.0]])
-    np.testing.assert_allclose(central_slopes(field, inner), [[0.3 * 6 + 5, -2, 3]], rtol=1e-6)
+    np.testing.assert_allclose(
+        central_slopes(field, inner, field), [[0.3 * 6 + 5, -2, 3]], rtol=1e-6
+    )
     # At an end the place beyond it is the end itself.
-    end = central_slopes(field, np.array([[0.0, 6.0, 2.0]]))
+    end = central_slopes(field, np.array([[0.0, 6.0, 2.0]]), field)
     np.testing.assert_allclose(end, [[(0.3 + 2) / 2, -1, 0]], rtol=1e-6, atol=1e-9)
     # Beside a missing vertex, along x, the slope within the cell.
     np.testing.assert_allclose(field.values(np.array([[6.25, 3.0, 4.0]])), np.nan)
-    found = central_slopes(field, np.array([[5.25, 3.0, 4.0]]))
+    found = central_slopes(field, np.array([[5.25, 3.0, 4.0]]), field)
     np.testing.assert_allclose(found[0, 0], values[4, 3, 6] - values[4, 3, 5], rtol=1e-6)
     np.testing.assert_allclose(found[0, 1:], [-2, 5.25], rtol=1e-6)
 
@@ -541,7 +544,7 @@ def fields(arrays: Arrays = NUMPY) -> tuple[FrameField, WarpedField, Grid]:
     values[:, :, 5] = np.nan
     own = Grid(counts=(10, 9, 7), origin=np.zeros(3), spacing=np.ones(3))
     frame = Frame(values=values, first=(0, 0, 0))
-    inner = FrameField(frame, own, arrays)
+    inner = field_of(frame, own, arrays)
     return inner, WarpedField(inner, grid.warp), grid
 
 

@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
-from frame_field import NETWORK_SCENES, SCENES, FrameField
+from frame_field import NETWORK_SCENES, SCENES
 from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
 import fhash_codec
@@ -25,6 +25,7 @@ from fhash_codec.rendering.march_task import NUMPY, Arrays, Task
 from fhash_codec.rendering.plan import arrays_on
 from fhash_codec.rendering.stream_fields import Field
 from fhash_codec.rendering.stream_march import stream
+from fhash_codec.rendering.tiled_frame import FrameField
 
 Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
 
