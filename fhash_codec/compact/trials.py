@@ -229,7 +229,7 @@ def with_mask(task: PlanTask, sample: Sample, settings: TileSettings, error: flo
 
     error: root of the mean squared error of the decoded values, in data units.
     """
-    if task.blocks.complete:
+    if not task.blocks.masked:
         return settings
     levels = mask_levels(task.features, task.config.dilation, error, sample.tiles)
     return replace(settings, mask=levels)

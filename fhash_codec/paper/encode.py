@@ -21,6 +21,7 @@ from fhash_codec.features.selection import resolve_selection
 from fhash_codec.header import brief_history, describe_source, write_series
 from fhash_codec.measure.errors import find_bulk, whole_psnr
 from fhash_codec.measure.value_range import ValueRange, decoded_type
+from fhash_codec.paper.coding import MAX_LOSS, ModelCoding
 from fhash_codec.paper.fit import Goal, TrainedModel, train_model
 from fhash_codec.paper.network import Architecture, parameter_count
 from fhash_codec.paper.storage import load_network, write_model, write_tables
@@ -116,10 +117,10 @@ WRITINGS = 3
 """Times that coded tables are written at most until the file keeps its promise."""
 WHOLE = ValueRange(0.0, 1.0)
 """Range of the coreset's values."""
-EXCESS = 0.1
-"""dB above a promise for which coded tables are written once more."""
+EXCESS = 0.3
+"""dB of the error that tables may add, some 2 % of the bytes, for which they are written again."""
 NEAR = 0.01
-"""dB above a promise at which they aim then."""
+"""dB above a promise at which they aim then, and four times as much in a third writing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,22 +175,36 @@ def encode_paper(
     trained = train_model(selection.samples, selection.architecture, config, path, progress, goal)
     if aim is not None:  # the tables' numbers are about those of the training
         aim = _with_room(aim, _rounding(series, value_range, trained.rounding))
+    coding = None
+    if config.coded:
+        with stage("tables", "derivatives and layers of the model"):
+            coding = ModelCoding.of(selection.architecture, selection.samples, trained, aim)
     with stage("writing", "coordinates, masks, tables, network and header"):
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
-    mark = writer.mark()
+    mark, kept = writer.mark(), None
     for writing in range(WRITINGS):
         if writing:
             writer.rewind(mark)
-        header = _written(writer, series, selection, trained, config, aim, progress) | described
-        header = complete(header)
+        header = _written(writer, series, selection, trained, config, coding, progress)
+        header |= described
         with writer.preview(header) as container:
-            rounding = _rounding(series, value_range, load_network(container).rounding())
-        missing = _missing_psnr(config, header["quality"], rounding, value_range)
-        if aim is None or isinf(missing) or (missing <= 0 and (writing or missing > -EXCESS)):
+            network = load_network(container)
+            rounding = _rounding(series, value_range, network.rounding())
+            if coding is not None:
+                with stage("tables", "loss of the written tables"):
+                    header["model"]["tables_loss_db"] = round(coding.loss(network), 4)
+        header = complete(header)
+        if coding is None:
             break
-        if missing > 0 and trained.psnr is not None and trained.psnr < aim + missing:
-            break  # no coding of this model keeps it
-        aim += missing + NEAR
+        missing = _missing_psnr(config, header["quality"], rounding, value_range)
+        if not coding.in_reach:
+            missing = header["model"]["tables_loss_db"] - MAX_LOSS
+        if isinf(missing) or (missing <= 0 and (writing or coding.unused(missing) < EXCESS)):
+            break
+        following = kept or coding.corrected(missing, NEAR * 4**writing)
+        if following is None:
+            break
+        kept, coding = coding if missing <= 0 else None, following
     return EncodedNetwork(
         header=header,
         checkpoint=trained.checkpoint,
@@ -204,26 +219,17 @@ def _written(
     selection: Selection,
     trained: TrainedModel,
     config: EncodeConfig,
-    aim: float | None,
+    coding: ModelCoding | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write tables and network; return the header without coordinates and quality.
-
-    aim: PSNR in dB of the samples that coded tables should have, if any.
-    """
+    """Write tables and network; return the header without coordinates and quality."""
     coreset, architecture = selection.coreset, selection.architecture
-    if config.coded:
-        # No other tables need this module.
-        from fhash_codec.paper.table_step import Target, write_coded
-
+    if coding is not None:
         with stage("tables", "coded at a loss that the promise allows"):
-            target = Target(psnr=aim)
-            loss = write_coded(writer, architecture, selection.samples, trained, target, progress)
+            coding.write(writer, progress)
         vertices = parameter_count(architecture.levels, 1)
         header = _header(series, selection, trained, config, vertices)
-        header["required_features"] = ["transform"]
-        header["model"]["tables_loss_db"] = round(loss, 4)
-        return header
+        return header | {"required_features": ["transform"]}
     sparse = sparse_tables(coreset, config)
     with stage("writing", "tables"):
         vertices = write_tables(
