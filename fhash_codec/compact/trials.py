@@ -54,6 +54,7 @@ from fhash_codec.compact.transform import (
     refit,
     scale_of,
     squared_error,
+    wavelet,
     weighted,
 )
 from fhash_codec.progress import skip, stage, tell
@@ -194,17 +195,21 @@ def _tried_filled(
     tile = attempt.sample.blocks.tile
     bases = Bases(Sample(view.retile(tile), 1, task.workers), attempt.settings)
     t, z, y, x = attempt.settings.transform.axes
-    plane = in_plane("9/7", 3, tile)
-    trials = [(t, z, y, x), (NONE, z, y, x), (NONE, NONE, plane[2], plane[3])]
+    plane = in_plane("9/7", 4, tile)
+    deep = wavelet("9/7", 3, tile[0]), wavelet("9/7", 3, tile[1]), plane[2], plane[3]
+    trials = [(t, z, y, x), (NONE, z, y, x), (NONE, NONE, *deep[2:]), (t, z, *deep[2:]), deep]
     if bases.possible(*tile[1:]):
         trials.append((t, bases.along(1), bases.along(2), bases.along(3)))
     sample = Sample(block.retile(tile), 1 << 62, task.workers)
-    sample = sample.filled(moved_transform(sample, attempt.settings), TRIAL_DENSITY)
+    first = sample.filled(moved_transform(sample, attempt.settings), TRIAL_DENSITY)
     coding = task.goal.bounded(replace(attempt.coding, density=0))
     best, least = attempt, math.inf
     for axes in dict.fromkeys(trials):
         settings = replace(attempt.settings, transform=TransformSpec(axes=axes))
-        outcome = sample.run(moved_transform(sample, settings), coding)
+        moved = moved_transform(sample, settings)
+        # Deep wavelets leave hardly anything of a filling that was made for them.
+        filled = sample.filled(moved, TRIAL_DENSITY) if axes[2:] == deep[2:] else first
+        outcome = filled.run(moved, coding)
         size = _at_promise(outcome, task.goal)
         if size < least:
             step = step_after(settings, outcome, task.goal)

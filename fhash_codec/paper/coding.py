@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
-from fhash_codec.compact.encode import code_series
+from fhash_codec.compact.encode import CodedTable, at_psnr, code_series
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.features import Extent
@@ -90,6 +90,7 @@ class Component(Series):
         squares = sum(float(np.square(each - mean).sum()) for each in held)
         self.variance = squares / max(self.count, 1)
         self._packed = [np.packbits(mask) for mask in needed]
+        self._coded: CodedTable | None = None
 
     def read(self, step: int) -> Single:
         """Return the component (z, y, x) at a time node."""
@@ -118,18 +119,19 @@ class Component(Series):
             ),
         )
 
-    def write(
-        self, writer: ContainerWriter, name: str, error: float, progress: Progress
-    ) -> None:
+    def write(self, writer: ContainerWriter, name: str, error: float, progress: Progress) -> None:
         """Code and write the component with a mean squared error at the needed vertices."""
         low, high = self.value_range.ends
         psnr = 0.0
         if low < high and error < self.variance:
             psnr = max(20 * math.log10(high - low) - 10 * math.log10(error), 0.0)
         config = EncodeConfig(psnr=psnr, train="none", preset="small")
-        table = code_series(self, self.selection(), config, progress)
+        if self._coded is None:
+            self._coded = code_series(self, self.selection(), config, progress)
+        else:
+            self._coded = at_psnr(self._coded, config, progress)
         mixing = [float(str(number)) for number in self.mixing]
-        table.parts.write(writer, name, {"mixing": mixing})
+        self._coded.parts.write(writer, name, {"mixing": mixing})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,8 +117,8 @@ WRITINGS = 3
 """Times that coded tables are written at most until the file keeps its promise."""
 WHOLE = ValueRange(0.0, 1.0)
 """Range of the coreset's values."""
-EXCESS = 0.3
-"""dB of the error that tables may add, some 2 % of the bytes, for which they are written again."""
+EXCESS = 0.15
+"""dB of the error that tables may add, some 1 % of the bytes, for which they are written again."""
 NEAR = 0.01
 """dB above a promise at which they aim then, and four times as much in a third writing."""
 
@@ -185,20 +185,19 @@ def encode_paper(
     for writing in range(WRITINGS):
         if writing:
             writer.rewind(mark)
-        header = _written(writer, series, selection, trained, config, coding, progress)
-        header |= described
+        header = _written(writer, series, selection, trained, config, coding, progress) | described
+        header = complete(header)
         with writer.preview(header) as container:
             network = load_network(container)
             rounding = _rounding(series, value_range, network.rounding())
-            if coding is not None:
-                with stage("tables", "loss of the written tables"):
-                    header["model"]["tables_loss_db"] = round(coding.loss(network), 4)
-        header = complete(header)
-        if coding is None:
-            break
-        missing = _missing_psnr(config, header["quality"], rounding, value_range)
-        if not coding.in_reach:
-            missing = header["model"]["tables_loss_db"] - MAX_LOSS
+            if coding is None:
+                break
+            with stage("measuring", "loss of the coded tables"):
+                loss = coding.loss(network)
+        header["model"]["tables_loss_db"] = round(loss, 4)
+        missing = loss - MAX_LOSS
+        if coding.in_reach:
+            missing = _missing_psnr(config, header["quality"], rounding, value_range)
         if isinf(missing) or (missing <= 0 and (writing or coding.unused(missing) < EXCESS)):
             break
         following = kept or coding.corrected(missing, NEAR * 4**writing)

@@ -117,55 +117,45 @@ def _keys_and_box(region: Region) -> tuple[range, Box]:
     return range(*t), Box(z, y, x)
 
 
-FEW_BRICKS = 64
+FEW_BRICKS = 128
 """Bricks of some 1024 samples each that stand for all."""
+Points = tuple[list[Double], Single]
+"""Key indices, z, y and x of some samples, and their values."""
 
 
 class Samples:
     """The coreset at the key frames and the steps between, and errors of networks there.
 
-    The fringe does not count: the promise is about the coreset.
+    The fringe does not count: the promise is about the coreset. Errors are of normalised values,
+    which a reader decodes and clips to their range.
 
     Attributes:
         count: number of samples.
-        few: numbers of some evenly spread bricks.
     """
 
     def __init__(self, coreset: Coreset) -> None:
         self._coreset, counts = coreset, coreset.counts
         self.count = int(counts.sum())
         held = np.flatnonzero(counts)
-        self.few = held[:: -(-len(held) // FEW_BRICKS)]
-        ends = np.flatnonzero(np.diff(coreset.bricks[held, 0])) + 1
-        self._of_steps = np.split(held, ends)
+        self._steps = np.split(held, np.flatnonzero(np.diff(coreset.bricks[held, 0])) + 1)
+        few = held[:: -(-len(held) // FEW_BRICKS)]
+        self._few = [self._points(few[number : number + 1]) for number in range(len(few))]
 
     def error(self, network: Network) -> float:
-        """Return the mean squared error at all samples, step by step.
-
-        Errors are of normalised values, which a reader decodes and clips to their range.
-        """
-        return self._error(network, self._of_steps)
+        """Return the mean squared error at all samples, step by step."""
+        return _error(network, map(self._points, self._steps))
 
     def error_of_few(self, network: Network) -> float:
-        """Return the mean squared error at the samples of few bricks."""
-        return self._error(network, self.few[:, None])
+        """Return the mean squared error at the samples of few bricks, evenly spread."""
+        return _error(network, self._few)
 
     def slopes(self, network: Network) -> Single:
         """Return the derivatives (inputs, n) of the value by each input at few samples."""
-        points = (self._points(np.array([brick]))[0] for brick in self.few)
-        return np.concatenate([input_slopes(network, np.stack(each)) for each in points], axis=1)
+        slopes = [input_slopes(network, np.stack(points)) for points, _ in self._few]
+        return np.concatenate(slopes, axis=1)
 
-    def _error(self, network: Network, groups: Iterable[Longs]) -> float:
-        squares, count = [], 0
-        for bricks in groups:
-            points, values = self._points(bricks)
-            decoded = np.clip(sample_points(network, *points).astype(np.float64), 0.0, 1.0)
-            squares.append(float(np.square(decoded - values).sum()))
-            count += len(values)
-        return fsum(squares) / count
-
-    def _points(self, bricks: Longs) -> tuple[list[Double], Single]:
-        """Return key indices, z, y and x of the samples of some bricks of a step, and the values."""
+    def _points(self, bricks: Longs) -> Points:
+        """Return the samples of some bricks of a step."""
         coreset = self._coreset
         bits = np.unpackbits(coreset.mask_bits[bricks], axis=1, count=prod(coreset.brick_shape))
         brick, vertex = np.nonzero(bits)
@@ -181,6 +171,16 @@ class Samples:
         ]
         key = np.full(len(places), coreset.key_places[coreset.bricks[bricks[0], 0]])
         return [key, *space], coreset.values[places]
+
+
+def _error(network: Network, groups: Iterable[Points]) -> float:
+    """Return the mean squared error at the samples of all groups."""
+    squares, count = [], 0
+    for points, values in groups:
+        decoded = np.clip(sample_points(network, *points).astype(np.float64), 0.0, 1.0)
+        squares.append(float(np.square(decoded - values).sum()))
+        count += len(values)
+    return fsum(squares) / count
 
 
 MIN_WEIGHTS = 512
