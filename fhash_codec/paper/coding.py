@@ -71,10 +71,12 @@ class Component(Series):
         count: number of needed vertices.
         variance: of the component at these.
         value_range: of the component at these.
+        coded: the component as it was written last; None before.
     """
 
     def __init__(self, table: TrainedTable, mixing: Single, unmixing: Matrix) -> None:
-        t, z, y, x = self.shape = table.shape[:4]
+        t, z, y, x = table.shape[:4]
+        self.shape = t, z, y, x
         self.source = self.name = "component"
         self.dtype, self.units, self.attributes = np.dtype(np.float32), "", {}
         self.coords = {a: index_coordinate(a, n) for a, n in zip(AXES, self.shape, strict=True)}
@@ -90,7 +92,7 @@ class Component(Series):
         squares = sum(float(np.square(each - mean).sum()) for each in held)
         self.variance = squares / max(self.count, 1)
         self._packed = [np.packbits(mask) for mask in needed]
-        self._coded: CodedTable | None = None
+        self.coded: CodedTable | None = None
 
     def read(self, step: int) -> Single:
         """Return the component (z, y, x) at a time node."""
@@ -98,7 +100,8 @@ class Component(Series):
         return np.ascontiguousarray(self.table.read(region)[0] @ self.unmixing, np.float32)
 
     def _needed(self, node: int) -> Mask:
-        return self.table.needed((slice(node, node + 1), *self._region))[0]
+        mask: Mask = self.table.needed((slice(node, node + 1), *self._region))[0]
+        return mask
 
     def selection(self) -> FeatureSelection:
         """Return the needed vertices as the feature of the series."""
@@ -126,12 +129,12 @@ class Component(Series):
         if low < high and error < self.variance:
             psnr = max(20 * math.log10(high - low) - 10 * math.log10(error), 0.0)
         config = EncodeConfig(psnr=psnr, train="none", preset="small")
-        if self._coded is None:
-            self._coded = code_series(self, self.selection(), config, progress)
+        if self.coded is None:
+            self.coded = code_series(self, self.selection(), config, progress)
         else:
-            self._coded = at_psnr(self._coded, config, progress)
+            self.coded = at_psnr(self.coded, config, progress)
         mixing = [float(str(number)) for number in self.mixing]
-        self._coded.parts.write(writer, name, {"mixing": mixing})
+        self.coded.parts.write(writer, name, {"mixing": mixing})
 
 
 @dataclass(frozen=True, kw_only=True)
