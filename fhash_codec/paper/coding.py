@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import prod
 from operator import itemgetter
 
@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.compact.encode import CodedTable, at_psnr, code_series
+from fhash_codec.compact.goal import Bracket
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.features import Extent
@@ -55,8 +56,10 @@ MIN_ERROR = 1e-20
 """Smallest mean squared error that coding may reach, for tables without any error."""
 LAYERS_SHARE = 0.04
 """Share of the error that coding may add, for the quantised layers."""
-MOST = 4.0
-"""Factor by which a correction changes the error that coding adds, at most."""
+NEAR = 0.05
+"""dB of the error that coding adds by which a correction aims below what is allowed."""
+MOST = 6.0
+"""dB by which a correction changes that error, at most."""
 
 
 class Component(Series):
@@ -71,7 +74,6 @@ class Component(Series):
         count: number of needed vertices.
         variance: of the component at these.
         value_range: of the component at these.
-        coded: the component as it was written last; None before.
     """
 
     def __init__(self, table: TrainedTable, mixing: Single, unmixing: Matrix) -> None:
@@ -92,7 +94,6 @@ class Component(Series):
         squares = sum(float(np.square(each - mean).sum()) for each in held)
         self.variance = squares / max(self.count, 1)
         self._packed = [np.packbits(mask) for mask in needed]
-        self.coded: CodedTable | None = None
 
     def read(self, step: int) -> Single:
         """Return the component (z, y, x) at a time node."""
@@ -122,19 +123,19 @@ class Component(Series):
             ),
         )
 
-    def write(self, writer: ContainerWriter, name: str, error: float, progress: Progress) -> None:
-        """Code and write the component with a mean squared error at the needed vertices."""
+    def code(self, error: float, before: CodedTable | None, progress: Progress) -> CodedTable:
+        """Code the component with a mean squared error at the needed vertices.
+
+        before: of another error, whose plan is used again; None to make one.
+        """
         low, high = self.value_range.ends
         psnr = 0.0
         if low < high and error < self.variance:
             psnr = max(20 * math.log10(high - low) - 10 * math.log10(error), 0.0)
         config = EncodeConfig(psnr=psnr, train="none", preset="small")
-        if self.coded is None:
-            self.coded = code_series(self, self.selection(), config, progress)
-        else:
-            self.coded = at_psnr(self.coded, config, progress)
-        mixing = [float(str(number)) for number in self.mixing]
-        self.coded.parts.write(writer, name, {"mixing": mixing})
+        if before is None:
+            return code_series(self, self.selection(), config, progress)
+        return at_psnr(before, config, progress)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +153,7 @@ class ModelCoding:
         in_reach: whether the trained model keeps the promise; False without one.
         allowed: mean squared error that the written model may have.
         added: mean squared error that the coding of the tables should add.
+        tables: the coded components of each level.
     """
 
     coreset: Coreset
@@ -164,6 +166,7 @@ class ModelCoding:
     in_reach: bool
     allowed: float
     added: float
+    tables: list[list[CodedTable]] = field(default_factory=list)
 
     @classmethod
     def of(
@@ -172,8 +175,9 @@ class ModelCoding:
         samples_of: Coreset,
         model: TrainedModel,
         psnr: float | None,
+        progress: Progress,
     ) -> ModelCoding:
-        """Return the coding of a model for a promised PSNR in dB over the samples, if any.
+        """Code a model for a promised PSNR in dB over the samples, if any.
 
         Where the model has less, and without a promise, coding costs MAX_LOSS.
 
@@ -205,7 +209,7 @@ class ModelCoding:
         )
         error = max(exact + samples.error_of_few(network(layers)) - few, 0.0)
         slopes = samples.slopes(network(layers)).astype(np.float64)
-        return cls(
+        coding = cls(
             coreset=coreset,
             samples=samples,
             components=_components(architecture, samples.count, tables, slopes),
@@ -217,13 +221,30 @@ class ModelCoding:
             allowed=allowed,
             added=allowed - error,
         )
+        return coding._coded(progress)
 
-    def write(self, writer: ContainerWriter, progress: Progress) -> None:
-        """Code and write tables, layers and mask."""
+    def _coded(self, progress: Progress) -> ModelCoding:
+        """Return the model with tables coded for `added`, by the plans of the tables it has."""
         error = self._error_of_tables()
-        for level, components in enumerate(self.components, start=1):
-            for number, component in enumerate(components, start=1):
-                component.write(writer, component_name(level, number), error, progress)
+        tables = [
+            [
+                component.code(error, self.tables[level][number] if self.tables else None, progress)
+                for number, component in enumerate(components)
+            ]
+            for level, components in enumerate(self.components)
+        ]
+        return replace(self, tables=tables)
+
+    def write(self, writer: ContainerWriter) -> None:
+        """Write tables, layers and mask."""
+        for level, (tables, components) in enumerate(
+            zip(self.tables, self.components, strict=True), start=1
+        ):
+            for number, (table, component) in enumerate(
+                zip(tables, components, strict=True), start=1
+            ):
+                mixing = [float(str(each)) for each in component.mixing]
+                table.parts.write(writer, component_name(level, number), {"mixing": mixing})
         write_layers(writer, self.layers, self.layer_settings)
         write_mask(writer, self.coreset)
 
@@ -233,21 +254,24 @@ class ModelCoding:
         return 10 * math.log10(error / self.exact) if error > 0 and self.exact > 0 else 0.0
 
     def unused(self, missing: float) -> float:
-        """Return by how many dB tables could add more error; `missing` as in `corrected`."""
+        """Return by how many dB the tables could add more error.
+
+        missing: dB of PSNR that the file has less than allowed; below 0 what it has beyond that.
+        """
         found = self.allowed * 10 ** (missing / 10) - self.error
         return 10 * math.log10((self.allowed - self.error) / found) if found > 0 else math.inf
 
-    def corrected(self, missing: float, margin: float) -> ModelCoding | None:
-        """Return the coding whose file should have what is missing; None where none has it.
+    def corrected(self, missing: float, tried: Bracket, progress: Progress) -> ModelCoding | None:
+        """Code the tables so that the file should have what is missing; None where none has it.
 
-        missing: dB of PSNR that the file has less than allowed; below 0 what it has beyond that.
-        margin: dB that it should have beyond that.
+        missing: as in `unused`.
+        tried: logarithms of `added` between which it should be.
         """
         if self.allowed * 10 ** (-missing / 10) <= self.error:
             return None
-        wanted = self.allowed * 10 ** (-margin / 10) - self.error
-        change = min(max(10 ** (self.unused(missing) / 10), 1 / MOST), MOST)
-        return replace(self, added=self.added * change * wanted / (self.allowed - self.error))
+        change = min(max(self.unused(missing) - NEAR, -MOST), MOST)
+        added = tried.inside(math.log(self.added) + change * math.log(10) / 10)
+        return replace(self, added=math.exp(added))._coded(progress)
 
     def _error_of_tables(self) -> float:
         """Return the mean squared error at the needed vertices of each component.

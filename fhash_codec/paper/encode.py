@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import isinf, log10, prod
+from math import inf, isinf, log, log10, prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.goal import held_psnr, promise
+from fhash_codec.compact.goal import Bracket, held_psnr, promise
 from fhash_codec.config import PAIR, EncodeConfig
 from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick, with_steps_between
 from fhash_codec.features.features import Feature, FeatureChoice
@@ -113,14 +113,12 @@ Without them the quantiser step would have to be so small that the file is far l
 """
 
 
-WRITINGS = 3
+WRITINGS = 6
 """Times that coded tables are written at most until the file keeps its promise."""
 WHOLE = ValueRange(0.0, 1.0)
 """Range of the coreset's values."""
 EXCESS = 0.15
-"""dB of the error that tables may add, some 1 % of the bytes, for which they are written again."""
-NEAR = 0.01
-"""dB above a promise at which they aim then, and four times as much in a third writing."""
+"""dB of the error that tables may add, some 1 % of the bytes, for which they are coded again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,15 +175,17 @@ def encode_paper(
         aim = _with_room(aim, _rounding(series, value_range, trained.rounding))
     coding = None
     if config.coded:
-        with stage("tables", "derivatives and layers of the model"):
-            coding = ModelCoding.of(selection.architecture, selection.samples, trained, aim)
+        with stage("tables", "coded at a loss that the promise allows"):
+            coding = ModelCoding.of(
+                selection.architecture, selection.samples, trained, aim, progress
+            )
     with stage("writing", "coordinates, masks, tables, network and header"):
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
-    mark, kept = writer.mark(), None
+    mark, kept, tried = writer.mark(), None, Bracket(-inf, inf)
     for writing in range(WRITINGS):
         if writing:
             writer.rewind(mark)
-        header = _written(writer, series, selection, trained, config, coding, progress) | described
+        header = _written(writer, series, selection, trained, config, coding) | described
         header = complete(header)
         with writer.preview(header) as container:
             network = load_network(container)
@@ -198,12 +198,18 @@ def encode_paper(
         missing = loss - MAX_LOSS
         if coding.in_reach:
             missing = _missing_psnr(config, header["quality"], rounding, value_range)
-        if isinf(missing) or (missing <= 0 and (writing or coding.unused(missing) < EXCESS)):
+        kept = coding if missing <= 0 else kept
+        if isinf(missing) or (kept is coding and coding.unused(missing) < EXCESS):
             break
-        following = kept or coding.corrected(missing, NEAR * 4**writing)
-        if following is None:
+        tried = tried.narrowed(log(coding.added), too_low=missing <= 0)
+        if writing >= WRITINGS - 2 and kept is not None:
+            following: ModelCoding | None = kept
+        else:
+            with stage("tables", "coded again, as the error of the file asks"):
+                following = coding.corrected(missing, tried, progress)
+        if following is None or following is coding:
             break
-        kept, coding = coding if missing <= 0 else None, following
+        coding = following
     return EncodedNetwork(
         header=header,
         checkpoint=trained.checkpoint,
@@ -219,13 +225,12 @@ def _written(
     trained: TrainedModel,
     config: EncodeConfig,
     coding: ModelCoding | None,
-    progress: Progress,
 ) -> dict[str, Any]:
     """Write tables and network; return the header without coordinates and quality."""
     coreset, architecture = selection.coreset, selection.architecture
     if coding is not None:
-        with stage("tables", "coded at a loss that the promise allows"):
-            coding.write(writer, progress)
+        with stage("writing", "tables"):
+            coding.write(writer)
         vertices = parameter_count(architecture.levels, 1)
         header = _header(series, selection, trained, config, vertices)
         return header | {"required_features": ["transform"]}

@@ -248,7 +248,7 @@ def test_coded_tables_get_the_promise(tmp_path, monkeypatch, key_frames) -> None
     given = []
 
     def coding_of(*arguments):
-        given.append(arguments[-1])
+        given.append(arguments[-2])
         raise Reached
 
     monkeypatch.setattr("fhash_codec.paper.encode.ModelCoding.of", coding_of)
