@@ -29,7 +29,6 @@ from fhash_codec.compact.goal import (
     psnr_search,
     require_reach,
     search,
-    step_after,
     with_step,
 )
 from fhash_codec.compact.head import head_bytes
@@ -305,14 +304,12 @@ def _coded(
     return _code_to_psnr(coding_plan, aim, workers, progress)
 
 
-def at_psnr(table: CodedTable, config: EncodeConfig, progress: Progress) -> CodedTable:
-    """Return a table coded again by its plan, for the PSNR that the settings promise now."""
-    goal = replace(table.plan.goal, psnr=config.psnr)
-    step = step_after(table.plan.settings, table.outcome, goal)
-    settings = with_step(table.plan.settings, step, goal)
-    coding_plan = replace(table.plan, goal=goal, settings=settings)
+def with_steps_scaled(table: CodedTable, factor: float, progress: Progress) -> CodedTable:
+    """Return a table coded again by its plan, with a multiple of its step."""
+    settings = table.plan.settings
+    settings = with_step(settings, factor * settings.step, table.plan.goal)
     with thread_pool() as workers:
-        return _coded(coding_plan, goal, config, workers, progress)
+        return _code_all(replace(table.plan, settings=settings), workers, progress)
 
 
 def _is_exact_by_chance(table: CodedTable, goal: Goal) -> bool:

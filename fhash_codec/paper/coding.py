@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import prod
 from operator import itemgetter
 
@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
-from fhash_codec.compact.encode import CodedTable, at_psnr, code_series
-from fhash_codec.compact.goal import Bracket
+from fhash_codec.compact.encode import CodedTable, code_series, with_steps_scaled
+from fhash_codec.compact.goal import SLOPE, Bracket
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.features import Extent
@@ -56,7 +56,7 @@ MIN_ERROR = 1e-20
 """Smallest mean squared error that coding may reach, for tables without any error."""
 LAYERS_SHARE = 0.04
 """Share of the error that coding may add, for the quantised layers."""
-NEAR = 0.05
+NEAR = 0.03
 """dB of the error that coding adds by which a correction aims below what is allowed."""
 MOST = 6.0
 """dB by which a correction changes that error, at most."""
@@ -123,19 +123,14 @@ class Component(Series):
             ),
         )
 
-    def code(self, error: float, before: CodedTable | None, progress: Progress) -> CodedTable:
-        """Code the component with a mean squared error at the needed vertices.
-
-        before: of another error, whose plan is used again; None to make one.
-        """
+    def code(self, error: float, progress: Progress) -> CodedTable:
+        """Code the component with a mean squared error at the needed vertices."""
         low, high = self.value_range.ends
         psnr = 0.0
         if low < high and error < self.variance:
             psnr = max(20 * math.log10(high - low) - 10 * math.log10(error), 0.0)
         config = EncodeConfig(psnr=psnr, train="none", preset="small")
-        if before is None:
-            return code_series(self, self.selection(), config, progress)
-        return at_psnr(before, config, progress)
+        return code_series(self, self.selection(), config, progress)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,8 +147,9 @@ class ModelCoding:
         error: the same with the layers of the file.
         in_reach: whether the trained model keeps the promise; False without one.
         allowed: mean squared error that the written model may have.
-        added: mean squared error that the coding of the tables should add.
-        tables: the coded components of each level.
+        planned: the coded components of each level, with steps that should add what is allowed.
+        scale: steps of the tables, as a multiple of these.
+        tables: the components with these steps.
     """
 
     coreset: Coreset
@@ -165,8 +161,9 @@ class ModelCoding:
     error: float
     in_reach: bool
     allowed: float
-    added: float
-    tables: list[list[CodedTable]] = field(default_factory=list)
+    planned: list[list[CodedTable]]
+    scale: float
+    tables: list[list[CodedTable]]
 
     @classmethod
     def of(
@@ -209,31 +206,23 @@ class ModelCoding:
         )
         error = max(exact + samples.error_of_few(network(layers)) - few, 0.0)
         slopes = samples.slopes(network(layers)).astype(np.float64)
-        coding = cls(
+        components = _components(architecture, samples.count, tables, slopes)
+        of_each = _error_of_each(components, samples.count * (allowed - error))
+        planned = [[each.code(of_each, progress) for each in level] for level in components]
+        return cls(
             coreset=coreset,
             samples=samples,
-            components=_components(architecture, samples.count, tables, slopes),
+            components=components,
             layers=layers,
             layer_settings=layer_settings,
             exact=exact,
             error=error,
             in_reach=in_reach,
             allowed=allowed,
-            added=allowed - error,
+            planned=planned,
+            scale=1.0,
+            tables=planned,
         )
-        return coding._coded(progress)
-
-    def _coded(self, progress: Progress) -> ModelCoding:
-        """Return the model with tables coded for `added`, by the plans of the tables it has."""
-        error = self._error_of_tables()
-        tables = [
-            [
-                component.code(error, self.tables[level][number] if self.tables else None, progress)
-                for number, component in enumerate(components)
-            ]
-            for level, components in enumerate(self.components)
-        ]
-        return replace(self, tables=tables)
 
     def write(self, writer: ContainerWriter) -> None:
         """Write tables, layers and mask."""
@@ -261,31 +250,40 @@ class ModelCoding:
         found = self.allowed * 10 ** (missing / 10) - self.error
         return 10 * math.log10((self.allowed - self.error) / found) if found > 0 else math.inf
 
-    def corrected(self, missing: float, tried: Bracket, progress: Progress) -> ModelCoding | None:
+    def corrected(
+        self, missing: float, loss: float, tried: Bracket, progress: Progress
+    ) -> ModelCoding | None:
         """Code the tables so that the file should have what is missing; None where none has it.
 
         missing: as in `unused`.
-        tried: logarithms of `added` between which it should be.
+        loss: dB that coding has cost.
+        tried: logarithms of `scale` between which it should be.
         """
-        if self.allowed * 10 ** (-missing / 10) <= self.error:
+        of_coding = self.exact * 10 ** (loss / 10) - self.error
+        if self.allowed * 10 ** (missing / 10) - of_coding > self.allowed:
             return None
         change = min(max(self.unused(missing) - NEAR, -MOST), MOST)
-        added = tried.inside(math.log(self.added) + change * math.log(10) / 10)
-        return replace(self, added=math.exp(added))._coded(progress)
+        scale = math.exp(tried.inside(math.log(self.scale) + change / SLOPE))
+        tables = [
+            [with_steps_scaled(each, scale, progress) for each in level] for level in self.planned
+        ]
+        return replace(self, scale=scale, tables=tables)
 
-    def _error_of_tables(self) -> float:
-        """Return the mean squared error at the needed vertices of each component.
 
-        It is the same for all, and the variance where a component has less.
-        """
-        parts = [(each.count, each.variance) for level in self.components for each in level]
-        wanted = self.added * self.samples.count
-        rest, vertices = wanted, sum(count for count, _ in parts)
-        for count, variance in sorted(parts, key=itemgetter(1)):
-            if variance * vertices >= rest:
-                break
-            rest, vertices = rest - count * variance, vertices - count
-        return max(rest, 0.0) / vertices if vertices else math.inf
+def _error_of_each(components: list[list[Component]], squares: float) -> float:
+    """Return the mean squared error at the needed vertices of each component.
+
+    It is the same for all, and the variance where a component has less.
+
+    squares: sum of the squared errors of all.
+    """
+    parts = [(each.count, each.variance) for level in components for each in level]
+    vertices = sum(count for count, _ in parts)
+    for count, variance in sorted(parts, key=itemgetter(1)):
+        if variance * vertices >= squares:
+            break
+        squares, vertices = squares - count * variance, vertices - count
+    return squares / vertices if vertices else math.inf
 
 
 def _components(

@@ -113,12 +113,12 @@ Without them the quantiser step would have to be so small that the file is far l
 """
 
 
-WRITINGS = 6
+WRITINGS = 8
 """Times that coded tables are written at most until the file keeps its promise."""
 WHOLE = ValueRange(0.0, 1.0)
 """Range of the coreset's values."""
-EXCESS = 0.15
-"""dB of the error that tables may add, some 1 % of the bytes, for which they are coded again."""
+EXCESS = 0.06
+"""dB of the error that tables may add, some 0.5 % of the bytes, for which they are coded again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,12 +201,12 @@ def encode_paper(
         kept = coding if missing <= 0 else kept
         if isinf(missing) or (kept is coding and coding.unused(missing) < EXCESS):
             break
-        tried = tried.narrowed(log(coding.added), too_low=missing <= 0)
+        tried = tried.narrowed(log(coding.scale), too_low=missing <= 0)
         if writing >= WRITINGS - 2 and kept is not None:
             following: ModelCoding | None = kept
         else:
             with stage("tables", "coded again, as the error of the file asks"):
-                following = coding.corrected(missing, tried, progress)
+                following = coding.corrected(missing, loss, tried, progress)
         if following is None or following is coding:
             break
         coding = following
