@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import prod
 from operator import itemgetter
 
@@ -56,6 +56,10 @@ MIN_ERROR = 1e-20
 """Smallest mean squared error that coding may reach, for tables without any error."""
 LAYERS_SHARE = 0.04
 """Share of the error that coding may add, for the quantised layers."""
+WRITINGS = 8
+"""Times that a model is written at most until its file keeps the promise."""
+EXCESS = 0.06
+"""dB of the error that tables may add, some 0.5 % of the bytes, for which they are coded again."""
 NEAR = 0.03
 """dB of the error that coding adds by which a correction aims below what is allowed."""
 MOST = 6.0
@@ -150,6 +154,9 @@ class ModelCoding:
         planned: the coded components of each level, with steps that should add what is allowed.
         scale: steps of the tables, as a multiple of these.
         tables: the components with these steps.
+        tried: logarithms of `scale` that were too low and too high.
+        kept: a coding before this one whose file kept the promise, if any.
+        writings: how often the model was written, this time included.
     """
 
     coreset: Coreset
@@ -164,6 +171,9 @@ class ModelCoding:
     planned: list[list[CodedTable]]
     scale: float
     tables: list[list[CodedTable]]
+    tried: Bracket = field(default_factory=lambda: Bracket(-math.inf, math.inf))
+    kept: ModelCoding | None = None
+    writings: int = 1
 
     @classmethod
     def of(
@@ -250,24 +260,29 @@ class ModelCoding:
         found = self.allowed * 10 ** (missing / 10) - self.error
         return 10 * math.log10((self.allowed - self.error) / found) if found > 0 else math.inf
 
-    def corrected(
-        self, missing: float, loss: float, tried: Bracket, progress: Progress
-    ) -> ModelCoding | None:
-        """Code the tables so that the file should have what is missing; None where none has it.
+    def following(self, missing: float, loss: float, progress: Progress) -> ModelCoding | None:
+        """Code the tables so that the file should have what is missing; None where this one is it.
 
         missing: as in `unused`.
         loss: dB that coding has cost.
-        tried: logarithms of `scale` between which it should be.
         """
-        of_coding = self.exact * 10 ** (loss / 10) - self.error
-        if self.allowed * 10 ** (missing / 10) - of_coding > self.allowed:
+        enough = missing <= 0 and self.unused(missing) < EXCESS
+        if math.isinf(missing) or enough or self.writings == WRITINGS:
             return None
+        kept = replace(self, kept=None) if missing <= 0 else self.kept
+        of_coding = self.exact * 10 ** (loss / 10) - self.error
+        hopeless = self.allowed * (10 ** (missing / 10) - 1) > of_coding
+        if hopeless or self.writings == WRITINGS - 1:
+            return None if kept is None or missing <= 0 else replace(kept, writings=WRITINGS)
+        tried = self.tried.narrowed(math.log(self.scale), too_low=missing <= 0)
         change = min(max(self.unused(missing) - NEAR, -MOST), MOST)
         scale = math.exp(tried.inside(math.log(self.scale) + change / SLOPE))
         tables = [
             [with_steps_scaled(each, scale, progress) for each in level] for level in self.planned
         ]
-        return replace(self, scale=scale, tables=tables)
+        return replace(
+            self, scale=scale, tables=tables, tried=tried, kept=kept, writings=self.writings + 1
+        )
 
 
 def _error_of_each(components: list[list[Component]], squares: float) -> float:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import inf, isinf, log, log10, prod
+from math import log10, prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.goal import Bracket, held_psnr, promise
+from fhash_codec.compact.goal import held_psnr, promise
 from fhash_codec.config import PAIR, EncodeConfig
 from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick, with_steps_between
 from fhash_codec.features.features import Feature, FeatureChoice
@@ -113,12 +113,8 @@ Without them the quantiser step would have to be so small that the file is far l
 """
 
 
-WRITINGS = 8
-"""Times that coded tables are written at most until the file keeps its promise."""
 WHOLE = ValueRange(0.0, 1.0)
 """Range of the coreset's values."""
-EXCESS = 0.06
-"""dB of the error that tables may add, some 0.5 % of the bytes, for which they are coded again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,10 +177,8 @@ def encode_paper(
             )
     with stage("writing", "coordinates, masks, tables, network and header"):
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
-    mark, kept, tried = writer.mark(), None, Bracket(-inf, inf)
-    for writing in range(WRITINGS):
-        if writing:
-            writer.rewind(mark)
+    mark = writer.mark()
+    while True:
         header = _written(writer, series, selection, trained, config, coding) | described
         header = complete(header)
         with writer.preview(header) as container:
@@ -198,18 +192,11 @@ def encode_paper(
         missing = loss - MAX_LOSS
         if coding.in_reach:
             missing = _missing_psnr(config, header["quality"], rounding, value_range)
-        kept = coding if missing <= 0 else kept
-        if isinf(missing) or (kept is coding and coding.unused(missing) < EXCESS):
+        with stage("tables", "coded at a loss that the promise allows"):
+            coding = coding.following(missing, loss, progress)
+        if coding is None:
             break
-        tried = tried.narrowed(log(coding.scale), too_low=missing <= 0)
-        if writing >= WRITINGS - 2 and kept is not None:
-            following: ModelCoding | None = kept
-        else:
-            with stage("tables", "coded again, as the error of the file asks"):
-                following = coding.corrected(missing, loss, tried, progress)
-        if following is None or following is coding:
-            break
-        coding = following
+        writer.rewind(mark)
     return EncodedNetwork(
         header=header,
         checkpoint=trained.checkpoint,

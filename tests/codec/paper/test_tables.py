@@ -23,7 +23,7 @@ from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.paper import tables as small_parts
-from fhash_codec.paper.coding import MAX_LOSS, Component, ModelCoding
+from fhash_codec.paper.coding import MAX_LOSS, WRITINGS, Component, ModelCoding
 from fhash_codec.paper.encode import select
 from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.model import PointSampler, PointTables, SparsePatch, decode_region
@@ -265,14 +265,27 @@ def test_a_correction_changes_steps_by_what_is_missing(random_model, gain) -> No
     found = coding.error + (coding.allowed - coding.error) * 10 ** (gain / 10)
     missing, loss = (10 * math.log10(found / each) for each in (coding.allowed, coding.exact))
     assert coding.unused(missing) == pytest.approx(-gain)
-    corrected = coding.corrected(missing, loss, Bracket(-math.inf, math.inf), silent)
-    assert 5.5 * math.log(corrected.scale) == pytest.approx(-gain - 0.03)
+    if -0.06 < gain <= 0:
+        assert coding.following(missing, loss, silent) is None
+        return
+    following = coding.following(missing, loss, silent)
+    assert 5.5 * math.log(following.scale) == pytest.approx(-gain - 0.03)
+    assert (following.kept is None) == (gain > 0)
     # Never what was tried already.
     for tried in (Bracket(0.0, 0.1), Bracket(-0.1, 0.0)):
-        between = math.log(coding.corrected(missing, loss, tried, silent).scale)
-        assert tried.low < between < tried.high
+        between = math.log(replace(coding, tried=tried).following(missing, loss, silent).scale)
+        assert tried.low <= between <= tried.high
     # More is missing than coding has cost.
-    assert coding.corrected(missing + 9, loss, Bracket(-9.0, 9.0), silent) is None
+    assert coding.following(missing + 9, loss, silent) is None
+
+
+def test_the_last_file_is_one_that_kept_the_promise(random_model) -> None:
+    first = coding_of(random_model)
+    second = first.following(-0.1, 0.0, silent)
+    assert second.scale > first.scale
+    last = replace(second, writings=WRITINGS - 1).following(0.01, 0.2, silent)
+    assert last.scale == first.scale
+    assert last.following(-0.1, 0.0, silent) is None
 
 
 def test_a_component_has_the_transform_that_suits_its_numbers() -> None:
