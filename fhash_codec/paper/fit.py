@@ -440,7 +440,7 @@ class _Fitting:
             epochs=plan.epochs,
             steps=plan.epochs * plan.batches,
             history=self._reached.history,
-            device=self._device,
+            device="cpu" if engine.name == "native" else self._device,
             engine=describe_engine(engine, self._threads),
             checkpoint=self._checkpoint,
             restarts=self._reached.restarts,
