@@ -32,9 +32,7 @@ ALLOWED = {
     "fhash_bench": {"fhash_bench", "fhash_cli", "fhash_codec", "fhash_formats"},
 }
 TORCH_FILES = {
-    "fhash_codec": re.compile(
-        r"paper/engines/(slab|fused/.+)\.py|devices\.py|rendering/torch_arrays\.py"
-    ),
+    "fhash_codec": re.compile(r"paper/engines/fused/.+\.py|devices\.py|rendering/torch_arrays\.py"),
     "fhash_bench": re.compile(r"(engines|train|paper/(bench|encodings|measures|trained))\.py"),
 }
 """Modules that train or evaluate tensors, march through them, or start training."""

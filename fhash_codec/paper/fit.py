@@ -389,7 +389,7 @@ class _Fitting:
         device, why = training_device(
             self._config.device,
             cpu_seconds(self._architecture, samples * epochs),
-            needed_bytes(self._architecture, self._coreset, batches),
+            needed_bytes(self._architecture, self._coreset),
         )
         tell("engine", f"tables and network at their random start, {why}")
         return device

@@ -69,7 +69,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native, slab"),
+        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native"),
         (
             {"preset": "published", "ratio": 9.0},
             "ratio is not for --preset published",
@@ -98,7 +98,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
                 "schedule": "constant",
                 "batch": 64,
                 "tables": "uint8",
-                "engine": "slab",
+                "engine": "native",
             }.items()
         ),
         (

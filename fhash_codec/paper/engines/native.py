@@ -3,10 +3,10 @@
 A training sample is a lattice vertex. Its embedding at the finest level is therefore one entry of
 the table, and every coarser level is a separable linear upsampling of a small sub-lattice; no 16
 corners are looked up per sample. The unit of work is a brick of vertices of one key frame, and a
-batch is a random set of bricks. It goes on from the state of the fused engine, and that from its
-own. What a brick needs stays in a core's cache from the upsampling to Adam. Like the finest embeddings, the numbers of the
-largest coarse table take part in the steps that need them alone, in blocks: they catch up on the
-steps between in closed form (`parameters.catch_up`).
+batch is a random set of bricks. What a brick needs stays in a core's cache from the upsampling to
+Adam. Like the finest embeddings, the numbers of the largest coarse table take part in the steps
+that need them alone, in blocks: they catch up on the steps between in closed form
+(`parameters.catch_up`). This engine and the fused one go on from each other's state.
 
 The bricks of a batch are divided among the threads in a fixed way. The same seed, number of
 threads and instructions of the processor give the same bits.

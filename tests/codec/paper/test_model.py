@@ -24,6 +24,7 @@ from fhash_codec.native.network import best_path
 from fhash_codec.paper import model as points
 from fhash_codec.paper import network as ranked
 from fhash_codec.paper.encode import select, sparse_tables
+from fhash_codec.paper.engines.native import NativeEngine
 from fhash_codec.paper.model import (
     PaperModel,
     PointSampler,
@@ -433,21 +434,16 @@ def test_going_on_after_a_restart_gives_the_same_bytes(field, tmp_path) -> None:
     assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
 
 
-@pytest.mark.torch
 def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypatch) -> None:
-    from fhash_codec.paper.engines.slab import SlabEngine
-
-    class Spoilt(SlabEngine):
+    class Spoilt(NativeEngine):
         def parameters(self):
             parameters = super().parameters()
             parameters.coarse[-1] = float("nan")
             return parameters
 
-    monkeypatch.setattr("fhash_codec.paper.engines.slab.SlabEngine", Spoilt)
+    monkeypatch.setattr("fhash_codec.paper.engines.native.NativeEngine", Spoilt)
     with pytest.raises(TrainingError, match="not finite"):
-        fhash_codec.encode(
-            field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01, engine="slab")
-        )
+        fhash_codec.encode(field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01))
     assert not list(tmp_path.iterdir())
 
 
