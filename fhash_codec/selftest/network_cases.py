@@ -413,7 +413,6 @@ NETWORK_CASES = (
         _sizes("hidden_layers", (0, 1, 2)),
         agrees,
         gradients,
-        more=_sizes("hidden_layers", (3, 8)),
     ),
     _case(
         "embeddings",
@@ -428,7 +427,7 @@ NETWORK_CASES = (
         "layers of one neuron, and of widths around the size of a kernel",
         _sizes("width", (1, 65)),
         agrees,
-        more=_sizes("width", (2, 63, 64, 257)),
+        more=_sizes("width", (2, 63, 64, 128)),
     ),
     _case(
         "wild-rates",

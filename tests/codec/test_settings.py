@@ -91,7 +91,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
             for name, value in {
                 "fold": 3,
                 "embedding_size": 1,
-                "hidden_layers": 3,
+                "hidden_layers": 1,
                 "width": 8,
                 "epochs": 1,
                 "learning_rate": 0.1,

@@ -157,7 +157,7 @@ def test_the_same_seed_path_and_threads_give_the_same_bits(model_of, path, count
 
 @pytest.mark.parametrize("case", ["plain", "a few vertices far apart", "no coarse levels"])
 def test_it_goes_on_from_the_state_of_an_engine_without_blocks(model_of, case) -> None:
-    """As that of the fused engine is."""
+    """The state of the fused engine has none."""
     coreset, architecture = model_of(case)
     random, bricks = np.random.default_rng(1), len(coreset.bricks)
     batches = [random.permutation(bricks)[: max(1, bricks // 3)] for _ in range(30)]
