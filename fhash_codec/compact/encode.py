@@ -60,6 +60,7 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.series import Series
 from fhash_formats.support.threads import thread_pool
+from fhash_formats.transform.tile import plain_step
 from fhash_formats.transform.values import at_origin
 
 DecodedTiles = Mapping[Index, npt.NDArray[Any]]
@@ -304,10 +305,13 @@ def _coded(
     return _code_to_psnr(coding_plan, aim, workers, progress)
 
 
-def with_steps_scaled(table: CodedTable, factor: float, progress: Progress) -> CodedTable:
-    """Return a table coded again by its plan, with a multiple of its step."""
+def at_step(table: CodedTable, step: float, progress: Progress) -> CodedTable:
+    """Return a table coded by its plan with another step, that of the plain quantiser."""
     settings = table.plan.settings
-    settings = with_step(settings, factor * settings.step, table.plan.goal)
+    step *= settings.step / plain_step(settings)
+    if step == settings.step:
+        return table
+    settings = with_step(settings, step, table.plan.goal)
     with thread_pool() as workers:
         return _code_all(replace(table.plan, settings=settings), workers, progress)
 

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
-from fhash_codec.compact.encode import CodedTable, code_series, with_steps_scaled
-from fhash_codec.compact.goal import SLOPE, Bracket
+from fhash_codec.compact.encode import CodedTable, at_step, code_series
+from fhash_codec.compact.goal import SLOPE, Bracket, step_after_gain
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.features import Extent
@@ -39,9 +39,12 @@ from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import AXES, Series, index_coordinate
 from fhash_formats.support.values import Mask, Single
+from fhash_formats.transform.tile import plain_step
 from fhash_formats.transform.tile_format import TileSettings
 
 Matrix = npt.NDArray[np.float64]
+Tables = list[list[CodedTable]]
+"""Coded components of each level, finest first."""
 
 MIN_IMPORTANCE = 1e-4
 """Smallest eigenvalue of M that is used, as a share of the largest of the same level.
@@ -151,10 +154,9 @@ class ModelCoding:
         error: the same with the layers of the file.
         in_reach: whether the trained model keeps the promise; False without one.
         allowed: mean squared error that the written model may have.
-        planned: the coded components of each level, with steps that should add what is allowed.
-        scale: steps of the tables, as a multiple of these.
-        tables: the components with these steps.
-        tried: logarithms of `scale` that were too low and too high.
+        step: the quantiser step of all components.
+        tables: the coded components of each level.
+        tried: logarithms of `step` that were too low and too high.
         kept: a coding before this one whose file kept the promise, if any.
         writings: how often the model was written, this time included.
     """
@@ -168,9 +170,8 @@ class ModelCoding:
     error: float
     in_reach: bool
     allowed: float
-    planned: list[list[CodedTable]]
-    scale: float
-    tables: list[list[CodedTable]]
+    step: float
+    tables: Tables
     tried: Bracket = field(default_factory=lambda: Bracket(-math.inf, math.inf))
     kept: ModelCoding | None = None
     writings: int = 1
@@ -217,8 +218,7 @@ class ModelCoding:
         error = max(exact + samples.error_of_few(network(layers)) - few, 0.0)
         slopes = samples.slopes(network(layers)).astype(np.float64)
         components = _components(architecture, samples.count, tables, slopes)
-        of_each = _error_of_each(components, samples.count * (allowed - error))
-        planned = [[each.code(of_each, progress) for each in level] for level in components]
+        step, coded = _coded(components, samples.count * (allowed - error), progress)
         return cls(
             coreset=coreset,
             samples=samples,
@@ -229,9 +229,8 @@ class ModelCoding:
             error=error,
             in_reach=in_reach,
             allowed=allowed,
-            planned=planned,
-            scale=1.0,
-            tables=planned,
+            step=step,
+            tables=coded,
         )
 
     def write(self, writer: ContainerWriter) -> None:
@@ -274,15 +273,41 @@ class ModelCoding:
         hopeless = self.allowed * (10 ** (missing / 10) - 1) > of_coding
         if hopeless or self.writings == WRITINGS - 1:
             return None if kept is None or missing <= 0 else replace(kept, writings=WRITINGS)
-        tried = self.tried.narrowed(math.log(self.scale), too_low=missing <= 0)
+        tried = self.tried.narrowed(math.log(self.step), too_low=missing <= 0)
         change = min(max(self.unused(missing) - NEAR, -MOST), MOST)
-        scale = math.exp(tried.inside(math.log(self.scale) + change / SLOPE))
-        tables = [
-            [with_steps_scaled(each, scale, progress) for each in level] for level in self.planned
-        ]
+        step = math.exp(tried.inside(math.log(self.step) + change / SLOPE))
         return replace(
-            self, scale=scale, tables=tables, tried=tried, kept=kept, writings=self.writings + 1
+            self,
+            step=step,
+            tables=_at_step(self.tables, step, progress),
+            tried=tried,
+            kept=kept,
+            writings=self.writings + 1,
         )
+
+
+def _coded(
+    components: list[list[Component]], squares: float, progress: Progress
+) -> tuple[float, Tables]:
+    """Code all components with one step, by a sum of the squared errors of all; step and tables.
+
+    Each is planned for its share. One step for all is then what the same error costs least with.
+    """
+    error = _error_of_each(components, squares)
+    tables = [[each.code(error, progress) for each in level] for level in components]
+    largest = max((each for level in tables for each in level), key=lambda each: each.outcome.size)
+    step = plain_step(largest.plan.settings)
+    tables = _at_step(tables, step, progress)
+    found = sum(each.outcome.squares for level in tables for each in level)
+    gain = 10 * math.log10(squares / found) if found > 0 else 0.0
+    if abs(gain) > EXCESS:
+        step = step_after_gain(step, gain)
+        tables = _at_step(tables, step, progress)
+    return step, tables
+
+
+def _at_step(tables: Tables, step: float, progress: Progress) -> Tables:
+    return [[at_step(each, step, progress) for each in level] for level in tables]
 
 
 def _error_of_each(components: list[list[Component]], squares: float) -> float:

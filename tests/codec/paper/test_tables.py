@@ -50,6 +50,7 @@ from fhash_codec.progress import silent
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import ArraySeries
+from fhash_formats.transform.tile import plain_step
 
 
 @pytest.mark.parametrize("key", range(5))
@@ -269,11 +270,12 @@ def test_a_correction_changes_steps_by_what_is_missing(random_model, gain) -> No
         assert coding.following(missing, loss, silent) is None
         return
     following = coding.following(missing, loss, silent)
-    assert 5.5 * math.log(following.scale) == pytest.approx(-gain - 0.03)
+    assert 5.5 * math.log(following.step / coding.step) == pytest.approx(-gain - 0.03)
     assert (following.kept is None) == (gain > 0)
     # Never what was tried already.
-    for tried in (Bracket(0.0, 0.1), Bracket(-0.1, 0.0)):
-        between = math.log(replace(coding, tried=tried).following(missing, loss, silent).scale)
+    begun = math.log(coding.step)
+    for tried in (Bracket(begun, begun + 0.1), Bracket(begun - 0.1, begun)):
+        between = math.log(replace(coding, tried=tried).following(missing, loss, silent).step)
         assert tried.low <= between <= tried.high
     # More is missing than coding has cost.
     assert coding.following(missing + 9, loss, silent) is None
@@ -282,9 +284,9 @@ def test_a_correction_changes_steps_by_what_is_missing(random_model, gain) -> No
 def test_the_last_file_is_one_that_kept_the_promise(random_model) -> None:
     first = coding_of(random_model)
     second = first.following(-0.1, 0.0, silent)
-    assert second.scale > first.scale
+    assert second.step > first.step
     last = replace(second, writings=WRITINGS - 1).following(0.01, 0.2, silent)
-    assert last.scale == first.scale
+    assert last.step == first.step
     assert last.following(-0.1, 0.0, silent) is None
 
 
@@ -300,6 +302,15 @@ def test_a_component_has_the_transform_that_suits_its_numbers() -> None:
     table = component.code(1e-4, silent)
     assert table.plan.settings.transform.axes[0].kind == "klt"
     assert 0.9e-4 < table.outcome.squares / table.outcome.count <= 1e-4
+
+
+def test_components_have_one_step_and_the_error_that_they_may(random_model) -> None:
+    coding = coding_of(random_model)
+    tables = [table for tables in coding.tables for table in tables]
+    for table in tables:
+        assert plain_step(table.plan.settings) == pytest.approx(coding.step)
+    squares = sum(table.outcome.squares for table in tables) / coding.samples.count
+    assert squares == pytest.approx(coding.allowed - coding.error, rel=0.2)
 
 
 def test_vertices_that_are_not_needed_are_not_told(random_model) -> None:
