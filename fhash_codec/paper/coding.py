@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.compact.encode import CodedTable, at_step, code_series
-from fhash_codec.compact.goal import SLOPE, Bracket, step_after_gain
+from fhash_codec.compact.goal import FINEST_PSNR, SLOPE, Bracket, step_after_gain
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.features import Extent
@@ -59,8 +59,10 @@ MIN_ERROR = 1e-20
 """Smallest mean squared error that coding may reach, for tables without any error."""
 LAYERS_SHARE = 0.04
 """Share of the error that coding may add, for the quantised layers."""
-WRITINGS = 8
+WRITINGS = 16
 """Times that a model is written at most until its file keeps the promise."""
+COMMON = 8
+"""Times up to which all tables have one step."""
 EXCESS = 0.06
 """dB of the error that tables may add, some 0.5 % of the bytes, for which they are coded again."""
 NEAR = 0.03
@@ -136,6 +138,7 @@ class Component(Series):
         psnr = 0.0
         if low < high and error < self.variance:
             psnr = max(20 * math.log10(high - low) - 10 * math.log10(error), 0.0)
+            psnr = min(psnr, FINEST_PSNR)  # no step of the quantiser gives more
         config = EncodeConfig(psnr=psnr, train="none", preset="small")
         return code_series(self, self.selection(), config, progress)
 
@@ -157,7 +160,8 @@ class ModelCoding:
         step: the quantiser step of all components.
         tables: the coded components of each level.
         tried: logarithms of `step` that were too low and too high.
-        kept: a coding before this one whose file kept the promise, if any.
+        kept: of the codings before this one whose file kept the promise the one with the largest
+            error, and what it was missing, below 0; None without one.
         writings: how often the model was written, this time included.
     """
 
@@ -173,7 +177,7 @@ class ModelCoding:
     step: float
     tables: Tables
     tried: Bracket = field(default_factory=lambda: Bracket(-math.inf, math.inf))
-    kept: ModelCoding | None = None
+    kept: tuple[float, ModelCoding] | None = None
     writings: int = 1
 
     @classmethod
@@ -268,22 +272,36 @@ class ModelCoding:
         enough = missing <= 0 and self.unused(missing) < EXCESS
         if math.isinf(missing) or enough or self.writings == WRITINGS:
             return None
-        kept = replace(self, kept=None) if missing <= 0 else self.kept
+        kept = self.kept
+        if missing <= 0 and (kept is None or missing > kept[0]):
+            kept = missing, replace(self, kept=None)
         of_coding = self.exact * 10 ** (loss / 10) - self.error
-        hopeless = self.allowed * (10 ** (missing / 10) - 1) > of_coding
-        if hopeless or self.writings == WRITINGS - 1:
-            return None if kept is None or missing <= 0 else replace(kept, writings=WRITINGS)
+        if self.allowed * (10 ** (missing / 10) - 1) > of_coding:
+            return None  # more is missing than coding has cost
+        number = self.writings + 1
+        if number == WRITINGS:
+            return kept and replace(kept[1], writings=WRITINGS)
+        if number > COMMON and kept is not None:
+            tables = kept[1]._with_larger_step(kept[0], number % len(self.tables), progress)
+            return replace(self, tables=tables, kept=kept, writings=number)
         tried = self.tried.narrowed(math.log(self.step), too_low=missing <= 0)
         change = min(max(self.unused(missing) - NEAR, -MOST), MOST)
         step = math.exp(tried.inside(math.log(self.step) + change / SLOPE))
-        return replace(
-            self,
-            step=step,
-            tables=_at_step(self.tables, step, progress),
-            tried=tried,
-            kept=kept,
-            writings=self.writings + 1,
-        )
+        tables = _at_step(self.tables, step, progress)
+        return replace(self, step=step, tables=tables, tried=tried, kept=kept, writings=number)
+
+    def _with_larger_step(self, missing: float, level: int, progress: Progress) -> Tables:
+        """Return the tables, one level with the step that adds the error that is left.
+
+        The error of small tables jumps from one step of all levels to the next.
+        """
+        left = (self.allowed - self.error) * (1 - 10 ** (-self.unused(missing) / 10))
+        own = sum(table.outcome.squares for table in self.tables[level]) / self.samples.count
+        gain = min(10 * math.log10(1 + left / own), MOST) if own > 0 else MOST
+        tables = list(self.tables)
+        step = step_after_gain(plain_step(tables[level][-1].plan.settings), gain)
+        tables[level] = [at_step(each, step, progress) for each in tables[level]]
+        return tables
 
 
 def _coded(
@@ -296,7 +314,8 @@ def _coded(
     error = _error_of_each(components, squares)
     tables = [[each.code(error, progress) for each in level] for level in components]
     largest = max((each for level in tables for each in level), key=lambda each: each.outcome.size)
-    step = plain_step(largest.plan.settings)
+    widest = max(each.plan.goal.data_range for level in tables for each in level)
+    step = min(plain_step(largest.plan.settings), widest or math.inf)
     tables = _at_step(tables, step, progress)
     found = sum(each.outcome.squares for level in tables for each in level)
     gain = 10 * math.log10(squares / found) if found > 0 else 0.0

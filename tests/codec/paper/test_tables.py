@@ -23,7 +23,7 @@ from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.paper import tables as small_parts
-from fhash_codec.paper.coding import MAX_LOSS, WRITINGS, Component, ModelCoding
+from fhash_codec.paper.coding import COMMON, MAX_LOSS, WRITINGS, Component, ModelCoding
 from fhash_codec.paper.encode import select
 from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.model import PointSampler, PointTables, SparsePatch, decode_region
@@ -281,11 +281,18 @@ def test_a_correction_changes_steps_by_what_is_missing(random_model, gain) -> No
     assert coding.following(missing + 9, loss, silent) is None
 
 
-def test_the_last_file_is_one_that_kept_the_promise(random_model) -> None:
+def test_the_last_file_is_the_nearest_that_kept_the_promise(random_model) -> None:
     first = coding_of(random_model)
-    second = first.following(-0.1, 0.0, silent)
+    second = first.following(-0.02, 0.0, silent)
     assert second.step > first.step
-    last = replace(second, writings=WRITINGS - 1).following(0.01, 0.2, silent)
+    third = second.following(-0.05, 0.0, silent)
+    assert third.kept[1].step == first.step
+    refined = replace(third, writings=COMMON).following(0.01, 0.2, silent)
+    changed = [
+        ours is not theirs for ours, theirs in zip(refined.tables, first.tables, strict=True)
+    ]
+    assert sum(changed) == 1
+    last = replace(refined, writings=WRITINGS - 1).following(0.01, 0.2, silent)
     assert last.step == first.step
     assert last.following(-0.1, 0.0, silent) is None
 
