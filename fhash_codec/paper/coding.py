@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.compact.encode import CodedTable, at_step, code_series
-from fhash_codec.compact.goal import FINEST_PSNR, SLOPE, Bracket, step_after_gain
+from fhash_codec.compact.goal import SLOPE, Bracket, step_after_gain
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.features import Extent
@@ -57,6 +57,8 @@ MAX_LOSS = 0.1
 """dB that coding may cost over the samples where no PSNR is promised or the promise is lost."""
 MIN_ERROR = 1e-20
 """Smallest mean squared error that coding may reach, for tables without any error."""
+MAX_PSNR = 120.0
+"""Largest PSNR in dB of a component: float32, in which readers evaluate, hardly has more."""
 LAYERS_SHARE = 0.04
 """Share of the error that coding may add, for the quantised layers."""
 WRITINGS = 16
@@ -138,7 +140,7 @@ class Component(Series):
         psnr = 0.0
         if low < high and error < self.variance:
             psnr = max(20 * math.log10(high - low) - 10 * math.log10(error), 0.0)
-            psnr = min(psnr, FINEST_PSNR)  # no step of the quantiser gives more
+            psnr = min(psnr, MAX_PSNR)
         config = EncodeConfig(psnr=psnr, train="none", preset="small")
         return code_series(self, self.selection(), config, progress)
 
