@@ -106,13 +106,15 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     """Return the plan of a series, with the step that should keep the promise.
 
     Where vertices do not count, one plan keeps the values that are there, and another fills them:
-    that of the fewer bytes is taken.
+    that of the fewer bytes is taken. Where no file tells them, their values mean nothing, and are
+    filled.
 
     settings: with a first guess of the step.
     """
     task.parts.begin("tiles and transform")
     view = in_part(task.blocks)
-    attempt = _planned(task, view, settings, 0)
+    present = task.blocks.complete or task.blocks.masked
+    attempt = _planned(task, view, settings, 0 if present else task.density)
     if not task.blocks.complete and task.asks("filling"):
         task.parts.begin("fill values")
         attempt = _with_filling(task, view, attempt)
@@ -158,8 +160,12 @@ def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
     """Return the plan that keeps the values where none count, or one that fills them.
 
     Both code the same block, since prices of parts of different tiles do not compare.
+
+    present: with the values that are there, or filled where these mean nothing.
     """
-    filled = _planned(task, view, present.settings, task.density)
+    filled = present
+    if task.blocks.masked:
+        filled = _planned(task, view, present.settings, task.density)
     shape = block_of(view.shape, COMPARED_VERTICES)
     cut = view.retile(shape)
     costs = part_costs(task, cut, present.settings)
@@ -168,6 +174,8 @@ def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
     t, z, y, x = (number * n for number, n in zip(index, shape, strict=True))
     block = view.boxes(shape, [(t, z, y, x)], [1])
     filled, size = _tried_filled(task, view, block, filled)
+    if not task.blocks.masked:
+        return filled
     kept = _size_of(task, block, present)
     tell("filling", f"a block takes {kept:.0f} bytes as it is, {size:.0f} filled")
     return present if kept <= size else filled
