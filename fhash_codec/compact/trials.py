@@ -58,7 +58,7 @@ from fhash_codec.compact.transform import (
     weighted,
 )
 from fhash_codec.progress import skip, stage, tell
-from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
 
 CODED_PART = 1 << 18
@@ -154,6 +154,8 @@ COMPARED_VERTICES = 5 << 18
 """Vertices of the block on which plans are compared: of half as many, bases are not worth it."""
 TRIAL_DENSITY = 2
 """Thoroughness of filling there: more of it changed no choice."""
+Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
+"""Transforms along (t, z, y, x)."""
 
 
 def _with_filling(task: PlanTask, view: Blocks, present: Attempt) -> Attempt:
@@ -203,20 +205,23 @@ def _tried_filled(
     tile = attempt.sample.blocks.tile
     bases = Bases(Sample(view.retile(tile), 1, task.workers), attempt.settings)
     t, z, y, x = attempt.settings.transform.axes
-    plane = in_plane("9/7", 4, tile)
-    deep = wavelet("9/7", 3, tile[0]), wavelet("9/7", 3, tile[1]), plane[2], plane[3]
-    trials = [(t, z, y, x), (NONE, z, y, x), (NONE, NONE, *deep[2:]), (t, z, *deep[2:]), deep]
+    plane, four = in_plane("9/7", 3, tile), in_plane("9/7", 4, tile)
+    trials = [(t, z, y, x), (NONE, z, y, x), (NONE, NONE, plane[2], plane[3])]
+    deep: list[Axes] = []
+    if not task.blocks.masked:  # of tables of a network
+        along = wavelet("9/7", 3, tile[0]), wavelet("9/7", 3, tile[1])
+        deep = [(t, z, four[2], four[3]), (*along, four[2], four[3])]
     if bases.possible(*tile[1:]):
         trials.append((t, bases.along(1), bases.along(2), bases.along(3)))
     sample = Sample(block.retile(tile), 1 << 62, task.workers)
     first = sample.filled(moved_transform(sample, attempt.settings), TRIAL_DENSITY)
     coding = task.goal.bounded(replace(attempt.coding, density=0))
     best, least = attempt, math.inf
-    for axes in dict.fromkeys(trials):
+    for axes in dict.fromkeys(trials + deep):
         settings = replace(attempt.settings, transform=TransformSpec(axes=axes))
         moved = moved_transform(sample, settings)
         # Deep wavelets leave hardly anything of a filling that was made for them.
-        filled = sample.filled(moved, TRIAL_DENSITY) if axes[2:] == deep[2:] else first
+        filled = sample.filled(moved, TRIAL_DENSITY) if axes in deep else first
         outcome = filled.run(moved, coding)
         size = _at_promise(outcome, task.goal)
         if size < least:
