@@ -24,7 +24,7 @@ ACCESS = {"default": "balanced", "small": "small", "fast": "fast", PUBLISHED: "b
 PRESETS = tuple(ACCESS)
 """Every preset, the default first."""
 
-ENGINES = ("fused", "native", "slab")
+ENGINES = ("fused", "native")
 """Training engines of the published network, the fastest first; `fused` is for CUDA alone."""
 
 SAMPLES = ("all", "keys", "published")
@@ -106,14 +106,14 @@ class EncodeConfig(Record):
         published=True,
     )
     hidden_layers: int = limits(
-        2, "published: hidden layers of the network", low=0, high=8, published=True
+        2, "published: hidden layers of the network", low=0, high=2, published=True
     )
     width: int = limits(
         0,
         "published: neurons of each hidden layer; 0 for 64, the published width, or 16 where "
         "tables are coded",
         low=0,
-        high=1024,
+        high=128,
         published=True,
     )
     epochs: int = limits(

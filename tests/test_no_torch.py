@@ -67,7 +67,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "diff": "diff data.npy run.fhz --min-psnr 50",
         "bench rate": "bench rate data.npy --target 40 --peer none --no-speed --effort 1 --json",
         "bench render": "bench render run.fhz --part accelerations --turns 1 --size 16 --json",
-        "selftest": "selftest --case constant-float32 --case engines --processes 1",
+        "selftest": "selftest --case constant-float32 --case devices --processes 1",
         "cuda": "render network.fhz -o cuda.png --march arm --device cuda",
         "bench train": "bench train data.npy",
         "compact on cuda": "encode data.npy -o cuda.fhz --device cuda",

@@ -73,7 +73,7 @@ AXES = (
     Axis(
         name="network",
         preset="published",
-        varied=_grid("hidden_layers", (1, 2, 3, 4), "width", (16, 32, 64, 128)),
+        varied=_grid("hidden_layers", (1, 2), "width", (16, 32, 64, 128)),
         reference=6,
         why="layers and neurons of the MLP (paper, Ablation Study)",
     ),

@@ -368,17 +368,8 @@ def _variants(
 
 
 def _compare(results: list[dict[str, Any]]) -> None:
-    """Add ratios over the slab engine in as many threads, and over one thread of the same engine.
-
-    Those over the slab engine are of seconds of processors; None without it.
-    """
+    """Add ratios over one thread of the same engine."""
     for result in results:
-        slab = _first(results, engine="slab", threads=result["threads"]) or _first(
-            results, engine="slab"
-        )
-        for kind in ("train", "infer"):
-            rate = f"{kind}_msamples_cpu_s"
-            result[f"{kind}_ratio"] = result[rate] / slab[rate] if slab else None
         one = _first(results, engine=result["engine"], path=result["path"], threads=1)
         result["thread_ratio"] = (
             result["train_msamples_s"] / one["train_msamples_s"]
@@ -395,7 +386,7 @@ def _first(results: list[dict[str, Any]], **facts: Any) -> dict[str, Any] | None
     )
 
 
-COLOURS = {"native": "#d1604b", "slab": "#4a86c0"}
+COLOURS = {"native": "#d1604b", "fused": "#4a86c0"}
 """Colours by engine."""
 STYLES = ("-", "--", ":", "-.")
 """Line styles of an engine's variants."""

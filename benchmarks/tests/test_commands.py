@@ -19,7 +19,6 @@ from fhash_bench.main import command
 from fhash_bench.pictures import vtk
 from fhash_bench.rate import generated as made
 from fhash_bench.rate.measuring import PEERS
-from fhash_codec.native.network import machine_paths
 from fhash_codec.progress import silent
 from fhash_formats.series import Series
 
@@ -332,8 +331,7 @@ def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     (series,) = report["series"]
-    expected = {"slab"} | ({"native"} if machine_paths() else set())
-    assert {entry["engine"] for entry in series["engines"]} == expected
+    assert {entry["engine"] for entry in series["engines"]} == {"native"}
     assert {"cores", "device"} <= set(report["machine"])
 
 
@@ -343,7 +341,7 @@ def test_it_prints_a_row_for_each_engine_and_draws_curves(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
     picture = tmp_path / "curves.png"
-    words = (*WORDS, data, "--engines", "native,slab", "--bricks-per-step", "1", "--plot", picture)
+    words = (*WORDS, data, "--engines", "native", "--bricks-per-step", "1", "--plot", picture)
     result = fhash(*words)
     assert (result.exit_code, result.stderr) == (0, "")
     facts, header, *rows = result.stdout.splitlines()
@@ -352,7 +350,7 @@ def test_it_prints_a_row_for_each_engine_and_draws_curves(
     assert header.split()[:2] == ["engine", "threads"]
     assert "CPU s to 50 dB" in header
     engines = [row.split()[0] for row in rows if row]
-    assert list(dict.fromkeys(engines))[:2] == ["native", "slab"]
+    assert list(dict.fromkeys(engines))[:1] == ["native"]
     assert any(row.startswith("points, M per CPU s: rays ") for row in rows)
     assert any("times as fast as the whole box" in row for row in rows)
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -368,7 +366,7 @@ def test_a_series_is_made_where_none_is_given(
 ) -> None:
     small = {key: replace(it, shape=(2, 8, 16, 16)) for key, it in made.MADE.items()}
     monkeypatch.setattr(made, "MADE", small)
-    words = (*WORDS, "--engines", "slab", "--json")
+    words = (*WORDS, "--engines", "native", "--json")
     result = fhash(*words)
     assert (result.exit_code, result.stderr) == (0, "")
     features = [entry["features"] for entry in json.loads(result.stdout)["series"]]

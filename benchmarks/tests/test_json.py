@@ -24,7 +24,7 @@ def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) 
     read = lambda: next(ticks) / 100  # noqa: E731
     monkeypatch.setattr(engines, "time", SimpleNamespace(perf_counter=read, process_time=read))
     monkeypatch.setattr(train, "INFER_SECONDS", 0.01)
-    words = ["bench", "train", data, "--seconds", "0.1", "--width", "4", "--engines", "slab"]
+    words = ["bench", "train", data, "--seconds", "0.1", "--width", "4", "--engines", "native"]
     check("bench train", parsed(fhash(*words, "--json", "-q")))
 
 

@@ -125,8 +125,8 @@ def test_slices_count_by_both_clocks() -> None:
 @pytest.mark.parametrize(
     ("variant", "label"),
     [
-        (Variant("slab", 1), "slab"),
-        (Variant("slab", 2), "slab 2 threads"),
+        (Variant("fused", 1), "fused"),
+        (Variant("fused", 2), "fused 2 threads"),
         (Variant("native", 1, "baseline"), "native baseline"),
     ],
 )
@@ -185,15 +185,12 @@ def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
     (entry,) = report["series"]
     assert entry["features"] == ["all"]
     engines = [run["engine"] for run in entry["engines"]]
-    paths = machine_paths()
-    assert list(dict.fromkeys(engines)) == (["native"] if paths else []) + ["slab"]
-    assert {run["path"] for run in entry["engines"] if run["engine"] == "native"} == set(paths)
+    assert set(engines) == {"native"}
+    assert {run["path"] for run in entry["engines"]} == set(machine_paths())
     measured = [words for words in calls if words[0] == "measuring"]
     assert len(measured) == TURNS * len(engines)
     assert [words[3] for words in measured[: len(engines)]] * TURNS == [w[3] for w in measured]
     assert all(later[1] == before[1] + 1 for before, later in pairwise(measured))
-    slab = next(run for run in entry["engines"] if run["engine"] == "slab")
-    assert (slab["train_ratio"], slab["infer_ratio"]) == (1.0, 1.0)
     for run in entry["engines"]:
         assert min(run["train_msamples_s"], run["train_msamples_cpu_s"]) > 0
         assert min(run["infer_msamples_s"], run["infer_msamples_cpu_s"]) > 0
@@ -230,17 +227,17 @@ def test_shares_are_of_the_peak_of_the_same_instructions(series: ArraySeries) ->
 def test_a_series_with_a_feature_is_measured_whole_too(series: ArraySeries) -> None:
     feature = f"interval:{np.median(series.values)}:{series.values.max()}"
     config = replace(CONFIG, features=(feature,), dilation=0)
-    report = bench_train(series, config, engines=("slab",), seconds=0.01)
+    report = bench_train(series, config, engines=("native",), seconds=0.01)
     sparse, whole = report["series"]
     assert (sparse["features"], whole["features"]) == ([feature], ["all"])
     assert sparse["samples"] < whole["samples"] == series.values.size
     assert sparse["brick_fill"] < whole["brick_fill"]
-    report = bench_train(series, config, engines=("slab",), seconds=0.01, whole=False)
+    report = bench_train(series, config, engines=("native",), seconds=0.01, whole=False)
     assert [entry["features"] for entry in report["series"]] == [[feature]]
 
 
 def test_bricks_of_a_step_are_measured_each(series: ArraySeries) -> None:
-    report = bench_train(series, CONFIG, engines=("slab",), seconds=0.01, bricks=(1, 3))
+    report = bench_train(series, CONFIG, engines=("native",), seconds=0.01, bricks=(1, 3))
     one, three = report["series"]
     assert one["batch_bricks"] == 1
     assert 2 < three["batch_bricks"] < 4
@@ -253,30 +250,21 @@ def test_generated_series_are_measured(name: str | None, monkeypatch: pytest.Mon
     monkeypatch.setattr(
         made, "MADE", {key: replace(it, shape=shape) for key, it in made.MADE.items()}
     )
-    entries = bench_train(name, CONFIG, engines=("slab",), seconds=0.01)["series"]
+    entries = bench_train(name, CONFIG, engines=("native",), seconds=0.01)["series"]
     features = [["all"]] if name == "generated:argon" else [["interval:0.25:2"], ["all"]]
     assert [entry["features"] for entry in entries] == features
     assert entries[-1]["samples"] == prod(shape)
-
-
-def test_there_is_no_ratio_without_the_slab_engine(series: ArraySeries) -> None:
-    (entry,) = bench_train(series, CONFIG, engines=("native",), seconds=0.01)["series"]
-    for run in entry["engines"]:
-        assert (run["train_ratio"], run["infer_ratio"]) == (None, None)
 
 
 def test_several_threads_are_beside_one(
     series: ArraySeries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train, "threads_for", lambda _: nullcontext_of(2))
-    (entry,) = bench_train(series, CONFIG, engines=("slab", "native"), seconds=0.01)["series"]
-    slab, slab_2, native, native_2 = entry["engines"][:4]
-    assert [run["threads"] for run in entry["engines"][:4]] == [1, 2, 1, 2]
-    assert (slab["thread_ratio"], native["thread_ratio"]) == (None, None)
-    expected = slab_2["train_msamples_s"] / slab["train_msamples_s"]
-    assert slab_2["thread_ratio"] == expected
-    expected = native_2["train_msamples_cpu_s"] / slab_2["train_msamples_cpu_s"]
-    assert native_2["train_ratio"] == expected
+    (entry,) = bench_train(series, CONFIG, engines=("native",), seconds=0.01)["series"]
+    one, two = entry["engines"][:2]
+    assert (one["threads"], two["threads"]) == (1, 2)
+    assert one["thread_ratio"] is None
+    assert two["thread_ratio"] == two["train_msamples_s"] / one["train_msamples_s"]
     assert {point["threads"] for point in entry["points"]} == {1, 2}
 
 
@@ -284,16 +272,6 @@ def nullcontext_of(number: int) -> Any:
     from contextlib import nullcontext
 
     return nullcontext(number)
-
-
-def test_the_native_engine_is_left_out_where_it_does_not_take_the_model(
-    series: ArraySeries,
-) -> None:
-    config = replace(CONFIG, hidden_layers=3)
-    with pytest.raises(InputError, match="native"):
-        bench_train(series, config, engines=("native",), seconds=0.01)
-    (entry,) = bench_train(series, config, seconds=0.01)["series"]
-    assert {run["engine"] for run in entry["engines"]} == {"slab"}
 
 
 @pytest.mark.parametrize(
@@ -321,10 +299,9 @@ def test_a_machine_that_stalls_at_the_first_steps_is_measured_all_the_same(
 
     ticking(times())
     monkeypatch.setattr(train, "INFER_SECONDS", 1e-5)
-    report = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)
+    report = bench_train(series, CONFIG, engines=("native",), seconds=0.01)
     run = report["series"][0]["engines"][0]
     assert run["train_msamples_s"] > 0
-    assert run["train_ratio"] == 1.0
 
 
 def test_it_runs_without_zarr() -> None:
@@ -336,7 +313,7 @@ def test_it_runs_without_zarr() -> None:
         "from fhash_bench.train import bench_train\n"
         "made.MADE = {'front': made.Made('front', (2, 8, 16, 16), '', False)}\n"
         "config = EncodeConfig(preset='published', tables='float16', width=4, hidden_layers=1)\n"
-        "print(len(bench_train(None, config, engines=('slab',), seconds=0.02)['series']))"
+        "print(len(bench_train(None, config, engines=('native',), seconds=0.02)['series']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1"]
@@ -365,7 +342,7 @@ def test_each_entry_has_a_row_of_two_panels(
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", savefig)
     entry = {
         "series": "a b", "features": ["all"], "batch_bricks": 64.0, "float16_bytes": 2_000_000,
-        "engines": [run("native", "baseline"), run("native", "x86-64-v3"), run("slab", None)],
+        "engines": [run("native", "baseline"), run("native", "x86-64-v3"), run("fused", None)],
     }  # fmt: skip
     plot({"series": [entry, entry]}, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
@@ -375,7 +352,7 @@ def test_each_entry_has_a_row_of_two_panels(
     assert cpu.lines[0].get_xydata().tolist() == [[1, 30], [3, 41]]
     assert wall.lines[0].get_xydata().tolist() == [[2, 30], [6, 41]]
     labels = [line.get_label() for line in cpu.lines][:3]
-    assert labels == ["native baseline x1", "native x86-64-v3 x1", "slab x1"]
+    assert labels == ["native baseline x1", "native x86-64-v3 x1", "fused x1"]
 
 
 @pytest.mark.usefixtures("quick")

@@ -61,6 +61,7 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.series import Series
 from fhash_formats.support.threads import thread_pool
+from fhash_formats.transform.tile import plain_step
 from fhash_formats.transform.values import at_origin
 
 DecodedTiles = Mapping[Index, npt.NDArray[Any]]
@@ -261,27 +262,14 @@ def code_series(
             series, selection, config, workers, progress, overhead=overhead
         )
         return_memory()
-
-        def coded(coding_plan: CodingPlan) -> CodedTable:
-            if goal.psnr is None or goal.data_range == 0:
-                return _code_all(coding_plan, workers, progress)
-            aim = _Aim(psnr=goal.psnr, data_range=goal.data_range)
-            if config.effort == 1:
-                aim = replace(aim, excess=QUICK_EXCESS, margin=QUICK_AIM)
-            elif config.access != "small":
-                aim = replace(aim, excess=USUAL_EXCESS)
-            if coding_plan.settings.head is not None:
-                aim = replace(aim, margin=MARGIN_OF_MLP, excess=max(aim.excess, EXCESS_OF_MLP))
-            return _code_to_psnr(coding_plan, aim, workers, progress)
-
-        table = coded(coding_plan)
+        table = _coded(coding_plan, goal, config, workers, progress)
         if goal.size is not None:
             window = ByteWindow.of(goal, overhead)
             table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
         plain = coding_plan.plain
         doubtful = coding_plan.saved is not None and coding_plan.saved < SURE
         if plain is not None and doubtful and table.plan.settings.head is not None:
-            other = coded(plain)
+            other = _coded(plain, goal, config, workers, progress)
             if other.outcome.size < table.outcome.size + head_bytes(table.plan.settings.head):
                 table = other
         if _is_exact_by_chance(table, goal):
@@ -296,6 +284,37 @@ def code_series(
     gain = dict(zip(GAIN, (*all_tiles(table.outcome.size), seconds), strict=True))
     table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
     return replace(table, bulk=bulk)
+
+
+def _coded(
+    coding_plan: CodingPlan,
+    goal: Goal,
+    config: EncodeConfig,
+    workers: ThreadPoolExecutor,
+    progress: Progress,
+) -> CodedTable:
+    """Code all tiles by a plan, again and again where a PSNR is promised, until it is reached."""
+    if goal.psnr is None or goal.data_range == 0:
+        return _code_all(coding_plan, workers, progress)
+    aim = _Aim(psnr=goal.psnr, data_range=goal.data_range)
+    if config.effort == 1:
+        aim = replace(aim, excess=QUICK_EXCESS, margin=QUICK_AIM)
+    elif config.access != "small":
+        aim = replace(aim, excess=USUAL_EXCESS)
+    if coding_plan.settings.head is not None:
+        aim = replace(aim, margin=MARGIN_OF_MLP, excess=max(aim.excess, EXCESS_OF_MLP))
+    return _code_to_psnr(coding_plan, aim, workers, progress)
+
+
+def at_step(table: CodedTable, step: float, progress: Progress) -> CodedTable:
+    """Return a table coded by its plan with another step, that of the plain quantiser."""
+    settings = table.plan.settings
+    step *= settings.step / plain_step(settings)
+    if step == settings.step:
+        return table
+    settings = with_step(settings, step, table.plan.goal)
+    with thread_pool() as workers:
+        return _code_all(replace(table.plan, settings=settings), workers, progress)
 
 
 def _is_exact_by_chance(table: CodedTable, goal: Goal) -> bool:

@@ -2,9 +2,8 @@
 
 One loop goes from trial to trial (`search`). Where it goes, a PSNR says by secants of the log step
 (`PsnrSearch`), a number of bytes by secants within a bracket (`SizeSearch`): on a sample by
-`find_step`, on all tiles in encode.py; the error of trained tables likewise in paper/table_step.py.
-Under a bound the cheapest of a few steps is looked for (`cheapest`). Searches know no
-codec; `find_step` codes a sample.
+`find_step`, on all tiles in encode.py. Under a bound the cheapest of a few steps is looked for
+(`cheapest`). Searches know no codec; `find_step` codes a sample.
 """
 
 from __future__ import annotations
@@ -97,19 +96,12 @@ def search(
     return best
 
 
-def geometric_mean(low: float, high: float) -> float:
-    """Return the middle of an interval of positive numbers on a logarithmic scale."""
-    return math.sqrt(low * high)
-
-
 @dataclass(frozen=True)
 class Bracket:
     """An interval that holds the number looked for, narrowed by each trial."""
 
     low: float
     high: float
-    middle: Callable[[float, float], float] = lambda low, high: (low + high) / 2
-    """Mean of the two ends that a bisection goes on with."""
 
     def narrowed(self, tried: float, *, too_low: bool) -> Bracket:
         """Return the part of the interval above a number that was too low, or else below it."""
@@ -121,7 +113,7 @@ class Bracket:
         """Return a prediction that lies inside the interval, else the middle of the interval."""
         if self.low < prediction < self.high:
             return prediction
-        return self.middle(self.low, self.high)
+        return (self.low + self.high) / 2
 
 
 FLAT_STEPS = 0.5

@@ -121,6 +121,8 @@ def _unit_deviations(tile: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
 
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     """Whether any tile of a sample has few enough different values, or regions of equal ones."""
+    if not (tiled.complete or tiled.masked):
+        return False  # vertices that do not count would need a label
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
     return any(_is_labels(tile, tiled) for tile in sample.tiles)
 

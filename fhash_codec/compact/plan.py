@@ -279,7 +279,7 @@ def _exact_plan(blocks: Blocks, tile: Shape, value_range: ValueRange, goal: Goal
         offsets=OFFSETS,
         double=True,
     )
-    settings = settings if blocks.complete else replace(settings, mask=MaskLevels())
+    settings = replace(settings, mask=MaskLevels()) if blocks.masked else settings
     return CodingPlan(
         blocks=blocks.retile(tile), settings=settings, coding=Coding(exact=True), goal=goal
     )

@@ -164,7 +164,7 @@ class Sample:
         weights: number of tiles of the series that each of them stands for.
         complete: whether the sample has all tiles with vertices that count.
         counted: approximate number of vertices that count in the series.
-        grams: products of lines of all tiles of the series, see `choices.bases.TileSample`;
+        grams: products of lines of all tiles of the series, by axis and centre, once computed;
             samples of the same grid share them.
     """
 

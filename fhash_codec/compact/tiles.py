@@ -204,6 +204,11 @@ class Blocks:
         return Tile(values[span], None if counted is None else counted[span])
 
     @property
+    def masked(self) -> bool:
+        """Whether tiles hold which of their vertices count."""
+        return self._extent.stored and not self.complete
+
+    @property
     def in_memory(self) -> bool:
         """Whether the box over all steps stays in memory."""
         return not self._only_layers and (

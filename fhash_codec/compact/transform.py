@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Tile
+from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks
 from fhash_codec.measure.errors import pointer
 from fhash_codec.measure.value_range import power_of_two
 from fhash_codec.progress import stage
@@ -49,7 +50,6 @@ def gram_of(planes: npt.NDArray[Any], center: float) -> Gram:
     return sums
 
 
-Result = TypeVar("Result")
 MAX_BASIS_LENGTH = 128
 """Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 
@@ -58,32 +58,10 @@ BASIS_STEPS = 1.4
 """Quantiser steps that a basis is as precise as: of one, more bytes were lost than won."""
 
 
-class TileSample(Protocol):
-    """Tiles that bases are fitted to, such as a `Sample`.
-
-    Attributes:
-        tiles: the tiles, all of one shape.
-        grams: products of the lines of all tiles, by axis and centre, once they were computed:
-            bases for other steps are fitted to them again.
-    """
-
-    tiles: list[Tile]
-    grams: dict[tuple[int, float], Gram]
-
-    @property
-    def allows_bases(self) -> bool:
-        """Whether bases of the data's own may be computed."""
-        ...
-
-    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
-        """Yield the results of `work` for all tiles that the sample stands for."""
-        ...
-
-
 class Bases:
     """The data's own bases along the axes of a tile, computed when they are asked for."""
 
-    def __init__(self, sample: TileSample, settings: TileSettings) -> None:
+    def __init__(self, sample: Sample, settings: TileSettings) -> None:
         self._sample, self._settings = sample, settings
         self._allowed = sample.allows_bases
         self._cache: dict[int, AxisTransform] = {}
@@ -146,7 +124,7 @@ def usual_transform(shape: Shape) -> TransformSpec:
     return TransformSpec(axes=(along_t, along_z, of_plane[2], of_plane[3]))
 
 
-def moved_transform(sample: TileSample, settings: TileSettings) -> TileSettings:
+def moved_transform(sample: Sample, settings: TileSettings) -> TileSettings:
     """Return settings with the same kinds of transforms for the tiles of a sample."""
     bases = Bases(sample, settings)
     shape = sample.tiles[0].values.shape
@@ -159,7 +137,7 @@ def moved_transform(sample: TileSample, settings: TileSettings) -> TileSettings:
     return replace(settings, transform=TransformSpec(axes=(t, z, y, x)))
 
 
-def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
+def refit(sample: Sample, settings: TileSettings) -> TileSettings:
     """Return settings with the data's own bases made anew for their step.
 
     Settings without such bases are returned themselves, the same object.

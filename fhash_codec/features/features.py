@@ -430,6 +430,7 @@ class Extent:
         background: mean of the finite values outside the coreset over the key frames, in data
             units; the mean of all values if none is outside.
         apart: the packed masks of each feature, by feature and key frame; empty unless asked for.
+        stored: whether the file gets the masks in the tiles of the values.
     """
 
     box: Box
@@ -439,6 +440,7 @@ class Extent:
     samples: int
     background: float
     apart: tuple[list[npt.NDArray[np.uint8]], ...] = ()
+    stored: bool = True
 
     @property
     def fraction(self) -> float:

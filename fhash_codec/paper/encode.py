@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import isinf, log10, prod
+from math import log10, prod
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from fhash_codec.features.selection import resolve_selection
 from fhash_codec.header import brief_history, describe_source, write_series
 from fhash_codec.measure.errors import find_bulk, whole_psnr
 from fhash_codec.measure.value_range import ValueRange, decoded_type
+from fhash_codec.paper.coding import MAX_LOSS, ModelCoding
 from fhash_codec.paper.fit import Goal, TrainedModel, train_model
 from fhash_codec.paper.network import Architecture, parameter_count
 from fhash_codec.paper.storage import load_network, write_model, write_tables
@@ -112,14 +113,8 @@ Without them the quantiser step would have to be so small that the file is far l
 """
 
 
-WRITINGS = 3
-"""Times that coded tables are written at most until the file keeps its promise."""
 WHOLE = ValueRange(0.0, 1.0)
 """Range of the coreset's values."""
-EXCESS = 0.1
-"""dB above a promise for which coded tables are written once more."""
-NEAR = 0.01
-"""dB above a promise at which they aim then."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,22 +169,34 @@ def encode_paper(
     trained = train_model(selection.samples, selection.architecture, config, path, progress, goal)
     if aim is not None:  # the tables' numbers are about those of the training
         aim = _with_room(aim, _rounding(series, value_range, trained.rounding))
+    coding = None
+    if config.coded:
+        with stage("tables", "coded at a loss that the promise allows"):
+            coding = ModelCoding.of(
+                selection.architecture, selection.samples, trained, aim, progress
+            )
     with stage("writing", "coordinates, masks, tables, network and header"):
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
     mark = writer.mark()
-    for writing in range(WRITINGS):
-        if writing:
-            writer.rewind(mark)
-        header = _written(writer, series, selection, trained, config, aim, progress) | described
+    while True:
+        header = _written(writer, series, selection, trained, config, coding) | described
         header = complete(header)
         with writer.preview(header) as container:
-            rounding = _rounding(series, value_range, load_network(container).rounding())
-        missing = _missing_psnr(config, header["quality"], rounding, value_range)
-        if aim is None or isinf(missing) or (missing <= 0 and (writing or missing > -EXCESS)):
+            network = load_network(container)
+            rounding = _rounding(series, value_range, network.rounding())
+            if coding is None:
+                break
+            with stage("measuring", "loss of the coded tables"):
+                loss = coding.loss(network)
+        header["model"]["tables_loss_db"] = round(loss, 4)
+        missing = loss - MAX_LOSS
+        if coding.in_reach:
+            missing = _missing_psnr(config, header["quality"], rounding, value_range)
+        with stage("tables", "coded at a loss that the promise allows"):
+            coding = coding.following(missing, loss, progress)
+        if coding is None:
             break
-        if missing > 0 and trained.psnr is not None and trained.psnr < aim + missing:
-            break  # no coding of this model keeps it
-        aim += missing + NEAR
+        writer.rewind(mark)
     return EncodedNetwork(
         header=header,
         checkpoint=trained.checkpoint,
@@ -204,26 +211,16 @@ def _written(
     selection: Selection,
     trained: TrainedModel,
     config: EncodeConfig,
-    aim: float | None,
-    progress: Progress,
+    coding: ModelCoding | None,
 ) -> dict[str, Any]:
-    """Write tables and network; return the header without coordinates and quality.
-
-    aim: PSNR in dB of the samples that coded tables should have, if any.
-    """
+    """Write tables and network; return the header without coordinates and quality."""
     coreset, architecture = selection.coreset, selection.architecture
-    if config.coded:
-        # No other tables need this module.
-        from fhash_codec.paper.table_step import Target, write_coded
-
-        with stage("tables", "coded at a loss that the promise allows"):
-            target = Target(psnr=aim)
-            loss = write_coded(writer, architecture, selection.samples, trained, target, progress)
+    if coding is not None:
+        with stage("writing", "tables"):
+            coding.write(writer)
         vertices = parameter_count(architecture.levels, 1)
         header = _header(series, selection, trained, config, vertices)
-        header["required_features"] = ["transform"]
-        header["model"]["tables_loss_db"] = round(loss, 4)
-        return header
+        return header | {"required_features": ["transform"]}
     sparse = sparse_tables(coreset, config)
     with stage("writing", "tables"):
         vertices = write_tables(

@@ -389,7 +389,7 @@ class _Fitting:
         device, why = training_device(
             self._config.device,
             cpu_seconds(self._architecture, samples * epochs),
-            needed_bytes(self._architecture, self._coreset, batches),
+            needed_bytes(self._architecture, self._coreset),
         )
         tell("engine", f"tables and network at their random start, {why}")
         return device
@@ -440,7 +440,7 @@ class _Fitting:
             epochs=plan.epochs,
             steps=plan.epochs * plan.batches,
             history=self._reached.history,
-            device=self._device,
+            device="cpu" if engine.name == "native" else self._device,
             engine=describe_engine(engine, self._threads),
             checkpoint=self._checkpoint,
             restarts=self._reached.restarts,

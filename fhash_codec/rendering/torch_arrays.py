@@ -10,9 +10,23 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from fhash_codec.paper.engines.slab import true_positions
 from fhash_codec.rendering.march_task import Array, Arrays
 from fhash_formats.errors import InputError
+
+
+def true_positions(mask: torch.Tensor, count: int) -> torch.Tensor:
+    """Return where a mask (n,) is not 0, int64 (count,), ascending.
+
+    `Tensor.nonzero` makes the host wait until the device has counted them.
+
+    Args:
+        mask: booleans, or 0 and 1 of an integer type.
+        count: number of entries that are not 0.
+    """
+    if mask.device.type == "cpu":
+        return mask.nonzero().squeeze(1)
+    # Entry number k is the first at which k have been counted.
+    return torch.searchsorted(mask.cumsum(0), torch.arange(1, count + 1, device=mask.device))
 
 
 class TorchArrays(Arrays):

@@ -299,8 +299,8 @@ LINES = [
     ("info x --jsn", "No such option"),
     ("info x y", "unexpected extra argument"),
     (
-        "bench train x --engines slab,fast",
-        "'fast' is no engine; allowed, separated by commas: fused, native, slab",
+        "bench train x --engines native,fast",
+        "'fast' is no engine; allowed, separated by commas: fused, native",
     ),
     ("bench", "Missing command; give one of "),
     ("bench foo", "No such command 'foo'"),

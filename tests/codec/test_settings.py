@@ -69,7 +69,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native, slab"),
+        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native"),
         (
             {"preset": "published", "ratio": 9.0},
             "ratio is not for --preset published",
@@ -91,14 +91,14 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
             for name, value in {
                 "fold": 3,
                 "embedding_size": 1,
-                "hidden_layers": 3,
+                "hidden_layers": 1,
                 "width": 8,
                 "epochs": 1,
                 "learning_rate": 0.1,
                 "schedule": "constant",
                 "batch": 64,
                 "tables": "uint8",
-                "engine": "slab",
+                "engine": "native",
             }.items()
         ),
         (

@@ -7,7 +7,7 @@ written anew after each part. Whatever fails or is left out makes the exit code 
 
 Parts, the most important first:
 - machine: device, software, peaks, seconds to start CUDA
-- oracle: gradients, values and bits of fused and slab, against the naive engine in float64
+- oracle: gradients, values and bits of fused and native, against the naive engine in float64
 - speed: training and evaluation by model and batch, steps one after another, and memory
 - curve: PSNR against seconds of training
 - card: the commands encode, diff and render (pictures and a film), on the device
@@ -61,7 +61,7 @@ class Run:
         quick = options.quick
         self.device, self.folder, self.work = options.device, options.folder, work
         self.on_cuda = self.device == "cuda"
-        self.engines = ("fused" if self.on_cuda else "slab", "native")
+        self.engines = ("fused", "native") if self.on_cuda else ("native",)
         self.shape = (2, 12, 16, 20) if quick else (8, 96, 128, 128)
         self.batches = (1 << 12,) if quick else (1 << 16, 1 << 14, 1 << 18, 1 << 20)
         self.seconds = 0.05 if quick else 0.5
@@ -279,6 +279,7 @@ def oracle(run: Run) -> Iterator[Result]:
 
     from fhash_codec.devices import same_bits
     from fhash_codec.paper.engines import make_engine
+    from fhash_codec.paper.engines.parameters import coarse_axes, used_numbers
     from fhash_formats.series import ArraySeries
 
     noise = ArraySeries(np.random.default_rng(3).random((3, 9, 20, 35), dtype=np.float32))
@@ -293,7 +294,7 @@ def oracle(run: Run) -> Iterator[Result]:
             for weight, bias in zip(naive.model.weights, naive.model.biases, strict=True)
         ]
         tables = torch.cat([table.grad.flatten() for table in list(naive.model.tables)[1:]])
-        for name in dict.fromkeys(("slab", run.engines[0])):
+        for name in run.engines:
             make = partial(
                 make_engine, name, model, coreset, rates, seed=1, device=run.device_of(name)
             )
@@ -301,9 +302,9 @@ def oracle(run: Run) -> Iterator[Result]:
             try:
                 engine: Any = make()
                 engine.train(every)
-                used = engine.upsampling.used.cpu()
+                used = used_numbers(coarse_axes(model, coreset), coreset, len(tables))[0]
                 expected = torch.cat([tables[used], *layer_gradients]).numpy()
-                apart = np.abs(10 * engine.flat_mean.cpu().numpy() - expected)
+                apart = np.abs(10 * engine.state()["flat_mean"] - expected)
                 apart /= np.abs(expected).max()
                 values = np.abs(engine.infer(every) - naive.infer(every))
                 trained = []
@@ -312,7 +313,7 @@ def oracle(run: Run) -> Iterator[Result]:
                         engine = make()
                         for _ in range(4):
                             engine.train(every)
-                        trained.append(engine.flat.cpu().numpy())
+                        trained.append(engine.state()["flat"])
                 result |= {
                     "gradient_median": float(np.median(apart)),
                     "gradient_beyond_1e-5": float((apart > 1e-5).mean()),
@@ -339,8 +340,6 @@ def speed(run: Run) -> Iterator[Result]:
         for width, layers in MODELS:
             yield measured(run, name, "all", width, layers)
         yield measured(run, name, "interval:0.25:2", 64, 1)
-    # The others do not take it.
-    yield measured(run, "slab", "all", 64, 3)
 
 
 def measured(run: Run, name: str, feature: str, width: int, layers: int) -> Result:
@@ -393,7 +392,7 @@ def measured(run: Run, name: str, feature: str, width: int, layers: int) -> Resu
                 result["infer"][plan.batch_samples] = rate(engine.infer, batches, run.seconds / 2)
             if device == "cuda" and "device_mb" not in result:
                 result["device_mb"] = torch.cuda.max_memory_allocated() / 1e6
-                result["expected_mb"] = needed_bytes(architecture, coreset, plan.batches) / 1e6
+                result["expected_mb"] = needed_bytes(architecture, coreset) / 1e6
                 if result["device_mb"] > result["expected_mb"]:
                     result["failed"] = "takes more memory than a training is said to need"
     except Exception as error:

@@ -29,7 +29,7 @@ OWN = (
     "fhash_codec.encoding",
     "fhash_codec.compact.encode",
     "fhash_codec.isosurface",
-    "fhash_codec.paper.engines.slab",
+    "fhash_codec.paper.engines.native",
     "fhash_codec.paper.train",
     "fhash_codec.paper.train",
     "fhash_codec.rendering.renderer",

@@ -186,13 +186,13 @@ def _engines(runs: list[dict[str, Any]]) -> str:
     """A row for each engine; seconds to a quality are those of processors."""
     goals = [goal["psnr"] for goal in runs[0]["seconds_to"]]
     header = (
-        *("engine", "threads", "train M/s", "per CPU s", "x slab", "of peak"),
-        *("infer per CPU s", "x slab", "of peak", "PSNR dB"),
+        *("engine", "threads", "train M/s", "per CPU s", "of peak"),
+        *("infer per CPU s", "of peak", "PSNR dB"),
         *(f"CPU s to {goal:g} dB" for goal in goals),
     )
     figures = (
-        *("train_msamples_s", "train_msamples_cpu_s", "train_ratio", "fraction_of_peak"),
-        *("infer_msamples_cpu_s", "infer_ratio", "infer_fraction_of_peak", "psnr"),
+        *("train_msamples_s", "train_msamples_cpu_s", "fraction_of_peak"),
+        *("infer_msamples_cpu_s", "infer_fraction_of_peak", "psnr"),
     )
     rows = [
         (

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from fhash_bench.paper.data import EMBEDDING_SIZE, WIDTH
 from fhash_codec.features.bricks import Coreset, sample_places
-from fhash_codec.paper.engines.parameters import SPREAD
-from fhash_codec.paper.engines.slab import SlabEngine, adam_step
+from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.engines.parameters import BETA1, BETA2, EPSILON, SPREAD, corrections
 from fhash_codec.paper.network import Architecture, Resolution, parameter_count
 
 
@@ -37,6 +37,28 @@ def of_key_frame(coreset: Coreset, key: int) -> Coreset:
         apart=(),
         fringe=None,
     )
+
+
+def adam_step(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float
+) -> None:
+    """Do one step of Adam in place, on tensors of one shape.
+
+    torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long
+    as loading torch itself.
+
+    Args:
+        parameter: the numbers to move.
+        gradient: their gradient.
+        mean: mean of the gradients.
+        square: mean of the squared gradients.
+        step: number of the step, from 1 on.
+        rate: learning rate.
+    """
+    correction, pace = corrections(step, rate)
+    mean.lerp_(gradient, 1 - BETA1)
+    square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    parameter.addcdiv_(mean, square.sqrt().mul_(correction).add_(EPSILON), value=-pace)
 
 
 HIDDEN_LAYERS = 2
@@ -480,7 +502,7 @@ class WeightedSum(torch.autograd.Function):
 
 
 class LatticeModel:
-    """A `SlabEngine` on grids whose finest level is the box itself.
+    """An engine of the codec on grids whose finest level is the box itself.
 
     A grid for each key frame is a level whose resolution along time is the number of key frames.
     """
@@ -506,7 +528,10 @@ class LatticeModel:
         )
         self.tables = parameter_count(architecture.levels, EMBEDDING_SIZE)
         self.mlp = architecture.parameters - self.tables
-        self.engine = SlabEngine(architecture, coreset, rates, seed=seed, device=device)
+        self.architecture = architecture
+        self.engine = make_engine(
+            "auto", architecture, coreset, rates, seed=seed, device=device.type
+        )
         self.places = torch.from_numpy(sample_places(coreset))
         self._dense: list[Tensor] | None = None
 
@@ -565,14 +590,15 @@ class LatticeModel:
 
     def moved(self) -> int:
         """Embeddings that a gradient ever moved."""
-        fine = self.engine.fine_square != 0
-        coarse = self.engine.flat_square[: self.engine.coarse] != 0
-        return int(fine.any(0).sum()) + int(coarse.view(-1, EMBEDDING_SIZE).any(1).sum())
+        state = self.engine.state()
+        fine = state["fine_square"] != 0
+        coarse = state["flat_square"][: -self.mlp].reshape(-1, EMBEDDING_SIZE) != 0
+        return int(fine.any(0).sum()) + int(coarse.any(1).sum())
 
     def arrays(self) -> list[npt.NDArray[np.float32]]:
         """The tables (buckets, E), 0 where no gradient moved them, then weights and biases."""
         numbers = self.engine.parameters()
-        tables, layers = numbers.dense(self.engine.architecture)
+        tables, layers = numbers.dense(self.architecture)
         finest = np.zeros((self.levels[0].size, EMBEDDING_SIZE), np.float32)
         finest[self.levels[0].buckets(self.places).numpy()] = numbers.fine.T
         rest = [number for layer in layers for number in layer]

@@ -36,11 +36,11 @@ from fhash_bench.paper.encodings import (
     LatticeModel,
     Level,
     Values,
+    adam_step,
     of_key_frame,
 )
 from fhash_codec.boxes import Sizes
 from fhash_codec.features.bricks import Coreset, sample_places
-from fhash_codec.paper.engines.slab import adam_step
 from fhash_codec.paper.network import ceil_log, level_resolutions
 from fhash_codec.paper.train import TrainingPlan
 from fhash_formats.errors import MissingDependencyError

@@ -72,8 +72,7 @@ def make_engine(
     """Return a new engine.
 
     Args:
-        name: fused, native, slab, or auto for the fastest that can be had on the device and
-            takes the model.
+        name: fused, native, or auto for fused on CUDA where it can be had, else native.
         architecture: the sizes of the model.
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
@@ -82,6 +81,8 @@ def make_engine(
 
     Raises:
         InputError: the name is unknown, or the engine cannot be had or does not take the model.
+
+    Warns (FhashWarning) where the CPU trains though the device is CUDA.
     """
     if name == "fused" or (name == "auto" and device == "cuda"):
         need_torch(f"device '{device}'" if name == "auto" else "engine 'fused'")
@@ -92,18 +93,11 @@ def make_engine(
         )
         if fused is not None:
             return fused
-    from fhash_codec.paper.engines.native import NativeEngine, refusal
+        device = "cpu"
+    if name in ("auto", "native"):
+        from fhash_codec.paper.engines.native import NativeEngine
 
-    reason = refusal(architecture, device)
-    if name == "auto":
-        name = "slab" if reason else "native"
-    if name == "native":
         return NativeEngine(architecture, coreset, rates, seed=seed, device=device)
-    if name == "slab":
-        need_torch(f"engine 'slab' ({reason})" if reason else "engine 'slab'")
-        from fhash_codec.paper.engines.slab import SlabEngine
-
-        return SlabEngine(architecture, coreset, rates, seed=seed, device=device)
     raise InputError(f"unknown engine '{name}'; known: auto, {', '.join(ENGINES)}")
 
 

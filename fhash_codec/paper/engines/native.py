@@ -1,9 +1,12 @@
 """The native engine: training and evaluation on a CPU by kernels in C++, a brick at a time.
 
-It does what the slab engine does, and both go on from each other's state. What a brick needs stays
-in a core's cache from the upsampling to Adam. Like the finest embeddings, the numbers of the
-largest coarse table take part in the steps that need them alone, in blocks: they catch up on the
-steps between in closed form (`parameters.catch_up`).
+A training sample is a lattice vertex. Its embedding at the finest level is therefore one entry of
+the table, and every coarser level is a separable linear upsampling of a small sub-lattice; no 16
+corners are looked up per sample. The unit of work is a brick of vertices of one key frame, and a
+batch is a random set of bricks. What a brick needs stays in a core's cache from the upsampling to
+Adam. Like the finest embeddings, the numbers of the largest coarse table take part in the steps
+that need them alone, in blocks: they catch up on the steps between in closed form
+(`parameters.catch_up`). This engine and the fused one go on from each other's state.
 
 The bricks of a batch are divided among the threads in a fixed way. The same seed, number of
 threads and instructions of the processor give the same bits.
@@ -240,7 +243,7 @@ def groups_of_corners(
 
 
 STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "flat_square")
-"""Arrays of the slab engine's state."""
+"""Arrays of the state of every engine."""
 FLUSH = 1024
 """Bricks that are brought up to date at a time."""
 PAD = 64
@@ -283,8 +286,8 @@ class NativeEngine:
     """An `Engine` on a CPU, in C++.
 
     Attributes:
-        fine, fine_mean, fine_square, visited: as the slab engine has them.
-        flat, flat_mean, flat_square, coarse: as the slab engine has them, but for the blocks of the
+        fine, fine_mean, fine_square, visited: as `FusedEngine` has them, on the host.
+        flat, flat_mean, flat_square, coarse: as `FusedEngine` has them, but for the blocks of the
             largest coarse table: these are as they were after the step in `blocks`.
         lazy: numbers of that table, the first ones in `flat`.
         blocks: number of the last training step that used each block of BLOCK of them, 0 for none,
@@ -414,7 +417,7 @@ class NativeEngine:
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return parameters, Adam's moments and the step number as arrays.
 
-        The arrays of the slab engine's state have its meaning. The blocks that are behind are there
+        The arrays of STATE mean in every engine the same. The blocks that are behind are there
         as they are, too, so that this engine goes on with the same bits.
         """
         flat, mean, square = self._settled_flat()
@@ -425,7 +428,7 @@ class NativeEngine:
         return {"step": np.array(self.step)} | arrays
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        """Continue from a `state`, also from one of the slab engine.
+        """Continue from a `state`, also from one of the fused engine.
 
         Raises KeyError or ValueError for one of another model.
         """

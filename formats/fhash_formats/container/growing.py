@@ -64,7 +64,12 @@ class TableParts:
     streams: Sequence[bytes]
     sizes: npt.NDArray[np.int64] | None = None
 
-    def write(self, writer: ContainerWriter, name: str = TABLE) -> None:
+    def write(
+        self,
+        writer: ContainerWriter,
+        name: str = TABLE,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> None:
         """Write the table, an array of a chunk for each tile.
 
         A single tile needs no shard, whose index and description would take some 120 bytes.
@@ -84,6 +89,7 @@ class TableParts:
             shard_shape=shards,
             chunks=iter(self.streams),
             dimension_names=("t", "z", "y", "x"),
+            attributes=attributes,
             codecs=transform_codecs(self.settings),
         )
 

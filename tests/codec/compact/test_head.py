@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planned import SingleTile
+from planned import plan_task
 from reference.head import Head, clip, inputs_of
 
 import fhash_codec
@@ -37,16 +37,10 @@ from fhash_codec.compact.head_training import (
     train_head,
     weights_of,
 )
-from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Coding, Index, Tile
-from fhash_codec.compact.transform import (
-    Bases,
-    Gram,
-    gram_of,
-    refit,
-    usual_transform,
-)
-from fhash_codec.paper.table_step import choose_transform
+from fhash_codec.compact.plan import first_settings
+from fhash_codec.compact.planner import by_prices
+from fhash_codec.compact.tiles import Coding, Tile
+from fhash_codec.compact.transform import Bases, Gram, gram_of
 from fhash_formats.errors import InputError
 from fhash_formats.transform.head import INPUTS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
@@ -478,50 +472,26 @@ def test_lines_are_added_one_after_the_other(
     np.testing.assert_allclose(gram, lines @ lines.T, rtol=0, atol=bound)
 
 
-class Hats(SingleTile):
-    """One tile, linear between every second vertex of y and x: all details of 5/3 are 0."""
-
-    shape = tile = (1, 1, 65, 65)
-    in_memory = False
-
-    def read(self, index: Index) -> Tile:
-        values = np.zeros((65, 65))
-        values[::2, ::2] = np.random.default_rng(0).normal(size=(33, 33))
-        values[1::2, ::2] = (values[:-1:2, ::2] + values[2::2, ::2]) / 2
-        values[:, 1::2] = (values[:, :-1:2] + values[:, 2::2]) / 2
-        return Tile(values.astype(np.float32).reshape(self.tile), None)
+def priced(values: npt.NDArray[Any], psnr: float) -> TransformSpec:
+    """The transform that the planner chooses."""
+    with ThreadPoolExecutor(1) as workers:
+        task = plan_task(values.astype(np.float32), workers, psnr=psnr)
+        settings = first_settings(task, task.blocks)
+        return by_prices(task, task.blocks, settings, 0)[1].transform
 
 
 def test_hats_are_transformed_by_5_3() -> None:
-    settings = TileSettings(
-        transform=usual_transform(Hats.tile), step=1e-3, center=0.0, low=-5.0, high=5.0
-    )
-    with ThreadPoolExecutor(1) as workers:
-        sample = Sample(Hats(), 1 << 20, workers)
-        chosen = choose_transform(sample, settings, Coding())
-    assert [axis.kind for axis in chosen.transform.axes] == ["none", "none", "5/3", "5/3"]
-    # Without bases of the data's own there is nothing to fit.
-    assert refit(sample, chosen) is chosen
-
-
-class FewShapes(SingleTile):
-    """One tile in which each line along x is a sum of two patterns that no wavelet has."""
-
-    shape = tile = (1, 8, 24, 40)
-    in_memory = True
-
-    def read(self, index: Index) -> Tile:
-        rng = np.random.default_rng(1)
-        values = rng.normal(size=(8 * 24, 2)) @ rng.normal(size=(2, 40))
-        return Tile(values.astype(np.float32).reshape(self.tile), None)
+    """A plane, linear between every second vertex of y and x: all details of 5/3 are 0."""
+    values = np.zeros((1, 1, 257, 257))
+    values[..., ::2, ::2] = np.random.default_rng(0).normal(size=(129, 129))
+    values[..., 1::2, ::2] = (values[..., :-1:2, ::2] + values[..., 2::2, ::2]) / 2
+    values[..., 1::2] = (values[..., :-1:2] + values[..., 2::2]) / 2
+    kinds = [axis.kind for axis in priced(values, 80.0).axes[2:]]
+    assert kinds == ["5/3", "5/3"]
 
 
 def test_few_patterns_get_a_basis_of_their_own() -> None:
-    settings = TileSettings(
-        transform=usual_transform(FewShapes.tile), step=0.01, center=0.0, low=-9.0, high=9.0
-    )
-    with ThreadPoolExecutor(1) as workers:
-        sample = Sample(FewShapes(), 1 << 20, workers)
-        chosen = choose_transform(sample, settings, Coding())
-        assert chosen.transform.axes[3].kind == "klt"
-        assert refit(sample, chosen) is not chosen
+    """Each line along x is a sum of two patterns that no wavelet has."""
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(8 * 24, 2)) @ rng.normal(size=(2, 40))
+    assert priced(values.reshape(1, 8, 24, 40), 60.0).axes[3].kind == "klt"

@@ -1,31 +1,33 @@
-"""Coded tables: their tiles, their loss, and the step that keeps a promise."""
+"""Coded tables: their components, their loss, and the error that keeps a promise."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, QualityError
+from fhash_codec.compact.goal import Bracket
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset, build_coreset
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.paper import tables as small_parts
+from fhash_codec.paper.coding import COMMON, MAX_LOSS, WRITINGS, Component, ModelCoding
 from fhash_codec.paper.encode import select
+from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.model import PointSampler, PointTables, SparsePatch, decode_region
-from fhash_codec.paper.network import Architecture, Network, level_resolutions
+from fhash_codec.paper.network import Architecture, ArrayTable, Network, level_resolutions
 from fhash_codec.paper.storage import (
     Needed,
     SparseTable,
@@ -37,21 +39,18 @@ from fhash_codec.paper.storage import (
     table_chunk,
     write_tables,
 )
-from fhash_codec.paper.table_step import MAX_LOSS, StepSearch, Window, choose_codings
 from fhash_codec.paper.tables import (
     MIN_WEIGHTS,
     WEIGHT_STEPS,
     CoarseTable,
     Samples,
-    components_of,
     quantised_layers,
-    tile_region,
-    tile_shape,
 )
 from fhash_codec.progress import silent
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import ArraySeries
+from fhash_formats.transform.tile import plain_step
 
 
 @pytest.mark.parametrize("key", range(5))
@@ -79,28 +78,23 @@ def test_regions_are_those_of_the_frame(random_model, key) -> None:
         )
 
 
-@pytest.fixture(scope="module")
-def samples(random_model) -> Samples:
-    selection = random_model.selection
-    tile = (2, *tile_shape(selection.architecture.levels[0])[1:3], 8)
-    return Samples(selection.coreset, tile)
-
-
-def test_errors_are_those_of_the_clipped_values_at_all_samples(random_model, samples) -> None:
+def test_errors_are_those_of_the_clipped_values_at_all_samples(random_model) -> None:
     network = random_model.network()
-    squares, count = samples.squares(network, list(samples.counts))
-    box = tuple((0, n) for n in network.box_size)
     coreset = random_model.selection.coreset
+    samples = Samples(coreset)
+    box = tuple((0, n) for n in network.box_size)
     masks = [unpack(coreset.occupancy[key], network.box_size) for key in range(5)]
     # Samples of the fringe do not count: the promise is about the coreset.
-    assert coreset.values.size > count == sum(int(mask.sum()) for mask in masks)
-    assert sum(samples.counts.values()) == count
+    assert coreset.values.size > samples.count == sum(int(mask.sum()) for mask in masks)
     direct = 0.0
     for key, mask in enumerate(masks):
         unit = np.clip(decode_region(network, key, box).astype(np.float64), 0, 1)
         error = unit - random_model.bricks.samples(key, box)
         direct += float((error[mask] ** 2).sum())
-    assert squares == pytest.approx(direct)
+    assert samples.error(network) == pytest.approx(direct / samples.count)
+    # Here a few bricks are all.
+    assert samples.error_of_few(network) == pytest.approx(direct / samples.count)
+    assert samples.slopes(network).shape == (network.inputs, samples.count)
 
 
 def layers(rows: int, columns: int):
@@ -208,54 +202,128 @@ def test_the_coreset_does_not_depend_on_what_is_not_needed(random_model) -> None
         )
 
 
+def coding_of(model, psnr: float | None = None) -> ModelCoding:
+    """The coding of a random model, as if it had been trained."""
+    trained = SimpleNamespace(fine=model.fine, tables=model.tables, layers=list(model.layers))
+    return ModelCoding.of(
+        model.selection.architecture,
+        model.selection.coreset,
+        cast(TrainedModel, trained),
+        psnr,
+        silent,
+    )
+
+
 def test_components_keep_the_embeddings_and_lie_in_their_range(random_model) -> None:
-    architecture = random_model.selection.architecture
-    slopes = np.random.default_rng(1).standard_normal((architecture.inputs, 200), np.float32)
-    samples = random_model.selection.coreset.values.size
-    with ThreadPoolExecutor(2) as workers:
-        codings = choose_codings(architecture, samples, random_model.trained, slopes, 0.01, workers)
-    assert {settings.step for coding in codings for settings in coding.settings} == {0.01}
-    for table, coding in zip(random_model.trained, codings, strict=True):
-        product = coding.unmixing @ coding.mixing.T
-        np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-9)
-        region = tile_region((0, 0, 0, 0), coding.tile, table.shape)
-        components, needed = components_of(table, coding, region)
-        assert needed.shape == coding.tile == components[0].shape
-        inside = tuple(slice(0, axis.stop) for axis in region)
-        embeddings = table.read((*region, slice(0, 2)))
+    coding = coding_of(random_model)
+    for table, components in zip(random_model.trained, coding.components, strict=True):
+        mixing = np.stack([component.mixing for component in components])
+        unmixing = np.stack([component.unmixing for component in components])
+        np.testing.assert_allclose(unmixing @ mixing.T, np.eye(len(mixing)), atol=1e-9)
+        region = tuple(slice(0, n) for n in table.shape)
+        needed = table.needed(region)
+        values = [
+            np.stack([component.read(node) for node in range(table.shape[0])])
+            for component in components
+        ]
         # Each of the two float32 products and the sums lose a rounding step or so.
-        largest = max(float(np.abs(component).max()) for component in components)
-        tolerance = 8 * np.finfo(np.float32).eps * largest * float(np.abs(coding.mixing).max())
-        mixed = mix_components(components, coding.mixing)[inside]
-        np.testing.assert_allclose(mixed, embeddings, atol=tolerance, rtol=1e-6)
-        for component, settings in zip(components, coding.settings, strict=True):
-            slack = 1e-6 * (settings.high - settings.low)
-            values = component[needed]
-            assert (values >= settings.low - slack).all()
-            assert (values <= settings.high + slack).all()
+        largest = max(float(np.abs(each).max()) for each in values)
+        tolerance = 8 * np.finfo(np.float32).eps * largest * float(np.abs(mixing).max())
+        mixed = mix_components(values, mixing)
+        np.testing.assert_allclose(mixed, table.read(region), atol=tolerance, rtol=1e-6)
+        for component, each in zip(components, values, strict=True):
+            assert component.count == needed.sum()
+            assert component.value_range.ends == (each[needed].min(), each[needed].max())
+            assert component.variance == pytest.approx(each[needed].var(), rel=1e-5)
 
 
-def test_the_transform_of_a_component_suits_its_numbers(random_model) -> None:
+def test_equal_errors_of_components_add_what_is_foretold(random_model) -> None:
+    """Errors of components that know nothing of one another, however long their mixing is."""
+    coding, network = coding_of(random_model), random_model.network()
+    box = tuple((0, n) for n in network.box_size)
+    random, size = np.random.default_rng(2), 1e-3
+    tables = []
+    for table, components in zip(network.tables, coding.components, strict=True):
+        values = table.values.astype(np.float64)
+        for component in components:
+            error = random.standard_normal(values.shape[:-1])[..., None]
+            values = values + size * error * component.mixing
+        tables.append(ArrayTable(values))
+    foretold = size**2 * sum(each.count for level in coding.components for each in level)
+    found, masks = 0.0, random_model.selection.coreset.occupancy
+    double = replace(network, tables=tables)
+    for key, bits in enumerate(masks):
+        before, after = (decode_region(each, key, box) for each in (network, double))
+        inside = unpack(bits, network.box_size)
+        found += float(np.square((after - before)[inside].astype(np.float64)).sum())
+    assert found == pytest.approx(foretold, rel=0.3)
+
+
+@pytest.mark.parametrize("gain", [-3.0, -0.5, 0.0, 0.5, 3.0])
+def test_a_correction_changes_steps_by_what_is_missing(random_model, gain) -> None:
+    """gain: dB of the error that coding has added beyond what it may."""
+    coding = coding_of(random_model)
+    found = coding.error + (coding.allowed - coding.error) * 10 ** (gain / 10)
+    missing, loss = (10 * math.log10(found / each) for each in (coding.allowed, coding.exact))
+    assert coding.unused(missing) == pytest.approx(-gain)
+    if -0.06 < gain <= 0:
+        assert coding.following(missing, loss, silent) is None
+        return
+    following = coding.following(missing, loss, silent)
+    assert 5.5 * math.log(following.step / coding.step) == pytest.approx(-gain - 0.03)
+    assert (following.kept is None) == (gain > 0)
+    # Never what was tried already.
+    begun = math.log(coding.step)
+    for tried in (Bracket(begun, begun + 0.1), Bracket(begun - 0.1, begun)):
+        between = math.log(replace(coding, tried=tried).following(missing, loss, silent).step)
+        assert tried.low <= between <= tried.high
+    # More is missing than coding has cost.
+    assert coding.following(missing + 9, loss, silent) is None
+
+
+def test_the_last_file_is_the_nearest_that_kept_the_promise(random_model) -> None:
+    first = coding_of(random_model)
+    second = first.following(-0.02, 0.0, silent)
+    assert second.step > first.step
+    third = second.following(-0.05, 0.0, silent)
+    assert third.kept[1].step == first.step
+    refined = replace(third, writings=COMMON).following(0.01, 0.2, silent)
+    changed = [
+        ours is not theirs for ours, theirs in zip(refined.tables, first.tables, strict=True)
+    ]
+    assert sum(changed) == 1
+    last = replace(refined, writings=WRITINGS - 1).following(0.01, 0.2, silent)
+    assert last.step == first.step
+    assert last.following(-0.1, 0.0, silent) is None
+
+
+def test_a_component_has_the_transform_that_suits_its_numbers() -> None:
     """A basis of their own suits a pattern whose strength changes at random."""
-    architecture = random_model.selection.architecture
-    slopes = np.ones((2, 200), np.float32)
     random = np.random.default_rng(0)
     pattern = random.standard_normal((16, 1, 1, 1)) * random.standard_normal((1, 8, 12, 12))
-    chosen = {}
-    for name, needed in (
-        ("complete", np.ones(pattern.shape, bool)),
-        ("part", np.broadcast_to(np.arange(12) < 9, pattern.shape)),
-    ):
-        both = np.stack([pattern, 0.5 * pattern], axis=-1).astype(np.float32)
-        one = replace(architecture, levels=(pattern.shape,), box_size=(8, 12, 12), key_frames=16)
-        with ThreadPoolExecutor(2) as workers:
-            [coding] = choose_codings(
-                one, pattern.size, [CoarseTable(both, needed)], slopes, 0.05, workers
-            )
-        chosen[name] = coding.settings[1].transform.axes
-    assert chosen["complete"][0].kind == "klt"
-    # Where vertices are not needed, a basis would describe them too.
-    assert all(axis.basis is None for axis in chosen["part"])
+    values = pattern.astype(np.float32)[..., None]
+    one = np.ones(1)
+    component = Component(
+        CoarseTable(values, np.ones(pattern.shape, bool)), one.astype(np.float32), one
+    )
+    table = component.code(1e-4, silent)
+    assert table.plan.settings.transform.axes[0].kind == "klt"
+    assert 0.9e-4 < table.outcome.squares / table.outcome.count <= 1e-4
+
+
+def test_components_have_one_step_and_the_error_that_they_may(random_model) -> None:
+    coding = coding_of(random_model)
+    tables = [table for tables in coding.tables for table in tables]
+    for table in tables:
+        assert plain_step(table.plan.settings) == pytest.approx(coding.step)
+    squares = sum(table.outcome.squares for table in tables) / coding.samples.count
+    assert squares == pytest.approx(coding.allowed - coding.error, rel=0.2)
+
+
+def test_vertices_that_are_not_needed_are_not_told(random_model) -> None:
+    for tables in coding_of(random_model).tables:
+        for table in tables:
+            assert table.plan.settings.mask is None
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +341,7 @@ def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
     if len(coded["key_frames"]) == 5:
         assert coded["tables_loss_db"] == pytest.approx(loss, abs=2e-4)
     else:
-        # The search sees key frames alone.
+        # The loss is that at key frames alone.
         between, other = (run["quality"]["between"] for run in (coded, exact))
         loss = other["psnr_key_frames"] - between["psnr_key_frames"]
         assert loss <= MAX_LOSS + 1e-3
@@ -343,50 +411,6 @@ def test_other_readers_see_what_is_needed(pair) -> None:
         assert container.arrays["tables/level_1/component_1"].shape == tuple(
             container.header["model"]["levels"][0]
         )
-
-
-TRIALS = 12
-
-
-def searched(
-    window: Window, error: Callable[[float], float], step: float, min_step: float = 1e-12
-) -> tuple[StepSearch, int]:
-    search = StepSearch(window, step, min_step)
-    trials = 0
-    while not search.done and trials < TRIALS:
-        search.add(error(search.step))
-        trials += 1
-    return search, trials
-
-
-@pytest.mark.parametrize("start", [1e-6, 1e-2, 1.0, 1e5])
-@pytest.mark.parametrize("power", [1.0, 1.7, 2.0, 3.0])
-@pytest.mark.parametrize("room", [0.1, 1.0, 20.0])
-def test_the_search_ends_in_the_window(start, power, room) -> None:
-    exact = 1e-5
-    window = Window.of(exact, exact * 10 ** (room / 10), 0.05)
-    search, trials = searched(window, lambda step: exact + 1e-4 * step**power, start)
-    assert search.done
-    assert search.best is not None
-    error = exact + 1e-4 * search.best**power
-    assert window.allowed * 10 ** (-0.05 / 10) <= error <= window.allowed
-    assert trials <= TRIALS
-
-
-def test_a_jump_over_the_window_keeps_the_allowed_side() -> None:
-    window = Window.of(1e-6, 1e-5, 0.05)
-    search, _ = searched(window, lambda step: 1e-6 + (1e-6 if step < 3 else 1e-3), 1.0)
-    assert search.best is not None
-    assert 2.0 < search.best < 3.0
-
-
-def test_nothing_below_the_smallest_step_is_tried() -> None:
-    window = Window.of(1e-6, 1e-5, 0.05)
-    search, trials = searched(window, lambda step: 1.0, 1.0, min_step=0.5)
-    assert search.best is None
-    assert search.done
-    assert search.step == 0.5
-    assert trials < TRIALS
 
 
 def coreset_of(fringe: bool) -> Coreset:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from math import log10
 from pathlib import Path
@@ -220,13 +219,12 @@ def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hid
     assert engine.step < plan.batches
 
 
-@pytest.mark.torch
 @pytest.mark.parametrize(("rate", "says"), [(0.02, "mean"), (0.01, "mean"), (0.02, "zero")])
 def test_a_network_that_died_of_its_rate_is_no_result(setup, coreset, rate, says) -> None:
-    plan, engine = setup(coreset, engine="slab", learning_rate=rate)
+    plan, engine = setup(coreset, learning_rate=rate)
     engine.rates = np.zeros_like(plan.rates)  # it learns nothing
-    engine.layers[-1].zero_()
-    engine.layers[-1][0, -1] = float(coreset.values.mean()) if says == "mean" else 0.0
+    engine.flat[-17:] = 0.0  # the last layer: 16 weights and a bias
+    engine.flat[-1] = float(coreset.values.mean()) if says == "mean" else 0.0
     if rate > 0.01 and says == "mean":
         with pytest.raises(Diverged, match="ended in a constant"):
             train(engine, plan, coreset, TrainingProgress())
@@ -335,33 +333,6 @@ def test_a_training_goes_on_to_its_goal_but_for_epochs_asked_for(
     # The first epochs are those of the training without a goal.
     assert trained.history[4]["psnr"] == pytest.approx(psnr, abs=0.01)
     assert [point["epoch"] for point in trained.history] == list(range(1, trained.epochs + 1))
-
-
-CONFIG_FIT_ON_CUDA = EncodeConfig(
-    preset="published",
-    tables="float16",
-    epochs=2,
-    width=8,
-    batch=20_000,
-    device="cuda",
-    engine="slab",
-)
-
-
-@pytest.mark.torch
-@pytest.mark.parametrize("tables", ["float16", "transform"])
-def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
-    from pretended_cuda import pretended_cuda
-
-    values = np.add.outer(np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9)))
-    config = replace(CONFIG_FIT_ON_CUDA, epochs=3, batch=0, tables=tables)
-    with pretended_cuda() as pretended, warnings.catch_warnings():
-        warnings.simplefilter("ignore", FhashWarning)  # of the quality of three epochs
-        figures = fhash_codec.encode(values.astype(np.float32), tmp_path / "a.fhz", config)
-    assert pretended.counts["launches"] > 100
-    assert figures["device"] == "cuda"
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert np.isfinite(volume[:]).any()
 
 
 def between() -> tuple[np.ndarray, Coreset, Coreset]:

@@ -27,10 +27,19 @@ from fhash_codec.paper.engines.fused.program import (
     missed_step_tables,
     with_files,
 )
-from fhash_codec.paper.engines.parameters import Chosen, corrections
-from fhash_codec.paper.engines.slab import SlabEngine
+from fhash_codec.paper.engines.native import NativeEngine, refusal
+from fhash_codec.paper.engines.parameters import (
+    Chosen,
+    Parameters,
+    check_state,
+    coarse_axes,
+    coarse_levels,
+    corrections,
+    initial_parameters,
+    used_numbers,
+)
 from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, time_nodes
-from fhash_codec.paper.network import Architecture, Network, Resolution
+from fhash_codec.paper.network import Architecture, Network, Resolution, parameter_count
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.support.values import Single
 
@@ -63,8 +72,26 @@ class RateRecord(ctypes.Structure):
     _fields_ = (("root", ctypes.c_float), ("pace", ctypes.c_float))
 
 
-class FusedEngine(SlabEngine):
-    """An `Engine` that trains on bricks by fused kernels."""
+STATE = ("fine", "fine_mean", "fine_square", "flat", "flat_mean", "flat_square")
+"""Tensors that a checkpoint stores, by name, besides `visited` and the step."""
+
+
+class FusedEngine:
+    """An `Engine` that trains on bricks by fused kernels.
+
+    The finest embeddings are stored for the samples alone, brick by brick. Adam visits just the
+    bricks of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on
+    its missing steps, whose gradient is zero, in closed form (`parameters.catch_up`).
+
+    Attributes:
+        fine: finest embeddings (E, samples) in the order of `Coreset.values`; `fine_mean` and
+            `fine_square` are their moments of Adam.
+        visited: number of the last training step that used each brick, 0 for none, int64 (bricks,)
+            on the host.
+        flat: the used numbers of the coarse tables, followed by the layers of the MLP, in one
+            vector; `flat_mean` and `flat_square` are their moments, `gradient` is their gradient.
+        coarse: number of the used numbers of the coarse tables.
+    """
 
     name = "fused"
 
@@ -80,21 +107,48 @@ class FusedEngine(SlabEngine):
     ) -> None:
         """Start from fresh parameters; arguments as in `make_engine`.
 
-        Newly compiled kernels are tried against slab's step on a few bricks.
+        The coreset is copied to the device. Newly compiled kernels are tried against the native
+        engine's step on a few bricks.
 
         Raises:
             Unavailable: the kernels cannot do this model, cannot be compiled, or fail the trial.
         """
         self._sizes, axes = kernel_sizes(architecture, coreset, kernels.limits)
         self._program = kernels.load(self._sizes)
-        super().__init__(architecture, coreset, rates, seed=seed, device=device)
+        self.architecture, self.coreset, self.rates = architecture, coreset, rates
+        self.device, self._seed = device, seed
+        self._counts = np.diff(coreset.offsets)
+
+        def sent(array: npt.NDArray[Any]) -> Tensor:
+            return torch.from_numpy(array).to(device, copy=True)
+
+        start = initial_parameters(architecture, coreset, seed)
+        self._numbers = parameter_count(
+            coarse_levels(architecture, coreset), architecture.embedding_size
+        )
+        self._used, rank = used_numbers(coarse_axes(architecture, coreset), coreset, self._numbers)
+        self.coarse = len(self._used)
+        self.fine = sent(start.fine)
+        self.flat = sent(np.concatenate([start.coarse[self._used], start.network]))
+        self.fine_mean, self.fine_square = (torch.zeros_like(self.fine) for _ in range(2))
+        self.flat_mean, self.flat_square, self.gradient = (
+            torch.zeros_like(self.flat) for _ in range(3)
+        )
+        self.visited = np.zeros(len(coreset.bricks), dtype=np.int64)
+        self.step = 0
+        # The kernels read on the device what the host has in `visited`.
+        self._arrays = {
+            "bricks": sent(coreset.bricks.astype(np.int64)),
+            "mask": sent(coreset.mask_bits),
+            "values": sent(coreset.values),
+            "offsets": sent(coreset.offsets),
+            "rank": None if rank is None else sent(rank),
+            "visited": sent(self.visited),
+        }
         self._axes = [
-            [torch.from_numpy(table).to(device) for table in (axis.start, axis.before, axis.after)]
-            for axis in axes
+            [sent(table) for table in (axis.start, axis.before, axis.after)] for axis in axes
         ]
-        self._missed = [torch.from_numpy(table).to(device) for table in missed_step_tables(rates)]
-        # The kernels read on the device what slab keeps on the host.
-        self._visited = torch.from_numpy(self.visited).to(device, copy=True)
+        self._missed = [sent(table) for table in missed_step_tables(rates)]
         limits = kernels.limits
         self._slots = self._sizes.slots(limits, 2)
         self._matrix_gradients = torch.empty(self._slots * self._sizes.matrices, device=device)
@@ -108,7 +162,7 @@ class FusedEngine(SlabEngine):
         """Do one training step on a batch; return the sum of squared errors before it."""
         ids = self._transferred(chosen)
         self.step += 1
-        scale = 2.0 / max(int(self.counts[chosen].sum()), 1)
+        scale = 2.0 / max(int(self._counts[chosen].sum()), 1)
         rate = RateRecord(*corrections(self.step, float(self.rates[self.step])))
         # A batch of few bricks is cut into parts, so that all multiprocessors have work.
         parts = max(1, min(self._slots // len(chosen), self._sizes.tiles))
@@ -160,7 +214,7 @@ class FusedEngine(SlabEngine):
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Single:
         """Return the values (n,) at the samples of some bricks."""
-        ends = np.cumsum(self.counts[chosen])
+        ends = np.cumsum(self._counts[chosen])
         values = torch.empty(int(ends[-1]) if len(ends) else 0, device=self.device)
         ids, first = self._transferred(np.stack([chosen, np.concatenate([[0], ends[:-1]])]))
         if len(values):
@@ -182,7 +236,7 @@ class FusedEngine(SlabEngine):
     @torch.no_grad()
     def settle(self) -> None:
         """Let every brick catch up with the present step, so that evaluation is faster."""
-        bricks = len(self.bricks)
+        bricks = len(self.visited)
         self._program.launch(
             "settle_bricks",
             min(bricks, 8 * self._slots),
@@ -195,12 +249,40 @@ class FusedEngine(SlabEngine):
             ],
         )
         self.visited[self.visited > 0] = self.step
-        self.settled = self.step
+
+    @torch.no_grad()
+    def parameters(self) -> Parameters:
+        """Return the trained numbers, on the CPU. Embeddings that no sample ever moved are 0."""
+        self.settle()
+        moved = (self.flat_mean != 0) | (self.flat_square != 0)
+        used = torch.where(moved, self.flat, 0.0) if self.step else self.flat
+        coarse = np.zeros(self._numbers, np.float32)
+        coarse[self._used] = used[: self.coarse].cpu().numpy()
+        trained = Parameters(
+            fine=self.fine.cpu().numpy(),
+            coarse=coarse,
+            network=self.flat[self.coarse :].cpu().clone().numpy(),
+        )
+        return trained.as_stored(self.architecture, self.coreset)
+
+    def state(self) -> dict[str, npt.NDArray[np.generic]]:
+        """Return parameters, Adam's moments and the step number as arrays."""
+        tensors = {name: getattr(self, name).cpu().numpy() for name in STATE}
+        return {"step": np.array(self.step), "visited": self.visited, **tensors}
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
         """Continue from a `state`; raises KeyError or ValueError for one of another model."""
-        super().restore(state)
-        self._visited.copy_(torch.from_numpy(self.visited))
+        check_state(state, {name: getattr(self, name).shape for name in (*STATE, "visited")})
+        self.step = int(state["step"])
+        self.visited[:] = state["visited"]
+        for name in STATE:
+            getattr(self, name).copy_(torch.from_numpy(state[name]))
+        self._send_visited()
+
+    def _send_visited(self) -> None:
+        visited = self._arrays["visited"]
+        assert visited is not None
+        visited.copy_(torch.from_numpy(self.visited))
 
     def _add_in_order(self, model: ModelRecord, places: Tensor, entries: Tensor) -> None:
         """Add coarse gradients, of each number in the order of the bricks.
@@ -225,49 +307,39 @@ class FusedEngine(SlabEngine):
         )
 
     def _try_kernels(self) -> None:
-        """Compare a few steps with slab's and start again; Unavailable where they differ."""
-        bricks = np.arange(min(TRIAL_BRICKS, len(self.bricks)))
+        """Compare a few steps with the native engine's and start again.
+
+        Raises Unavailable where they differ, or there is no such engine.
+        """
+        reason = refusal(self.architecture)
+        if reason is not None:
+            raise Unavailable(f"the engine native cannot try the kernels: {reason}")
+        bricks = np.arange(min(TRIAL_BRICKS, len(self.visited)))
         # In the third step the first brick catches up.
         batches = [batch for batch in (bricks, bricks[1:], bricks) if len(batch)][
             : len(self.rates) - 1
         ]
-        samples = int(self.coreset.offsets[len(bricks)])
-        start = [tensor.clone() for tensor in (self.fine[:, :samples], self.flat)]
+        start = {name: np.array(array) for name, array in self.state().items()}
+        native = NativeEngine(self.architecture, self.coreset, self.rates, seed=self._seed)
         results = []
-        for engine in (FusedEngine, SlabEngine):
-            steps = [float(engine.train(self, batch)) for batch in batches]
-            results.append((np.array(steps), engine.infer(self, bricks)))
-            self._start_again(*start)
-        (errors, values), (slab_errors, slab_values) = results
-        wrong_errors = not np.allclose(errors, slab_errors, rtol=TRIAL_ERROR, atol=1e-9)
-        difference = float(np.median(np.abs(values - slab_values)))
+        for engine in (self, native):
+            steps = [float(engine.train(batch)) for batch in batches]
+            results.append((np.array(steps), engine.infer(bricks)))
+        self.restore(start)
+        (errors, values), (native_errors, native_values) = results
+        wrong_errors = not np.allclose(errors, native_errors, rtol=TRIAL_ERROR, atol=1e-9)
+        difference = float(np.median(np.abs(values - native_values)))
         if wrong_errors or not difference <= TRIAL_VALUE:
             self._program.forget()
             raise Unavailable(
-                f"the kernels gave other results than slab on this device: errors {errors.tolist()}"
-                f" instead of {slab_errors.tolist()}, values {difference:.2g} apart"
+                f"the kernels gave other results than native on this device: {errors.tolist()}"
+                f" instead of {native_errors.tolist()}, values {difference:.2g} apart"
             )
-
-    def _start_again(self, fine: Tensor, flat: Tensor) -> None:
-        """Return to the start after a trial on the first samples, given the initial numbers."""
-        samples = fine.shape[1]
-        self.fine[:, :samples], self.flat[:] = fine, flat
-        for tensor in (
-            self.fine_mean[:, :samples],
-            self.fine_square[:, :samples],
-            self._visited,
-            self.flat_mean,
-            self.flat_square,
-            self.gradient,
-        ):
-            tensor.zero_()
-        self.visited[:] = 0
-        self.step = self.settled = 0
 
     def _transferred(self, numbers: npt.NDArray[np.int64]) -> Tensor:
         """Return numbers on the device, without waiting for it."""
         tensor = torch.from_numpy(np.ascontiguousarray(numbers))
-        if self.on_cpu:
+        if self.device.type == "cpu":
             return tensor
         return tensor.pin_memory().to(self.device, non_blocking=True)
 
@@ -278,17 +350,10 @@ class FusedEngine(SlabEngine):
             for table in range(3)
         )
         arrays = {
-            "bricks": self.bricks,
-            "mask": self.mask_bits,
-            "values": self.values,
-            "offsets": self.offsets,
-            "rank": self.upsampling.rank,
+            **self._arrays,
             "powers": self._missed[0],
             "weights": self._missed[1],
-            **{name: getattr(self, name) for name in ("fine", "fine_mean", "fine_square")},
-            "visited": self._visited,
-            **{name: getattr(self, name) for name in ("flat", "flat_mean", "flat_square")},
-            "gradient": self.gradient,
+            **{name: getattr(self, name) for name in (*STATE, "gradient")},
         }
         return ModelRecord(
             start=start,
@@ -646,7 +711,7 @@ def start_fused(
     except Unavailable as error:
         if required:
             raise InputError(f"engine 'fused' cannot be had: {error}; use --engine auto") from error
-        _warn_once(f"training takes the engine slab, since the faster one cannot be had: {error}")
+        _warn_once(f"the CPU trains, since kernels for CUDA cannot be had: {error}")
         return None
 
 

@@ -24,13 +24,8 @@ from fhash_codec.paper.engines.parameters import (
     catch_up,
     initial_parameters,
 )
-from fhash_codec.paper.engines.slab import (
-    Upsampling,
-    adam_step,
-    catch_up_numbers,
-    true_positions,
-)
 from fhash_codec.paper.network import Architecture
+from fhash_codec.rendering.torch_arrays import true_positions
 from fhash_formats.errors import InputError
 
 CPU = torch.device("cpu")
@@ -44,20 +39,20 @@ def test_unknown_engines_are_refused(noise_coreset) -> None:
         )
 
 
-def test_auto_is_native_where_it_takes_the_model_and_else_slab(noise_coreset) -> None:
+def test_auto_is_native_on_a_cpu(noise_coreset) -> None:
     coreset = noise_coreset((1, 2, 2, 2))
 
     def chosen(hidden_layers):
         architecture = Architecture.for_box((2, 2, 2), 1, hidden_layers=hidden_layers)
         return make_engine("auto", architecture, coreset, np.zeros(1), seed=0, device="cpu")
 
-    engine = chosen(2)
-    assert describe_engine(engine, 3) == {
+    assert describe_engine(chosen(2), 3) == {
         "engine": "native",
         "threads": 3,
         "path": machine_paths()[0],
     }
-    assert chosen(3).name == "slab"
+    with pytest.raises(InputError, match="2 hidden layers at most, not 3"):
+        chosen(3)
 
 
 def test_the_fused_engine_needs_a_cuda_device(noise_coreset) -> None:
@@ -113,67 +108,6 @@ def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
         assert np.array_equal(initial_parameters(architecture, coreset, 3).fine, expected.numpy())
 
 
-@pytest.mark.parametrize(("shape", "low"), [((3, 9, 10, 20), 0.3), ((2, 20, 30, 40), 0.9995)])
-def test_upsampling_equals_the_sixteen_corners(noise_coreset, shape, low) -> None:
-    coreset = noise_coreset(shape, low)
-    architecture = Architecture.for_box(coreset.box.shape, shape[0])
-    upsampling = Upsampling(architecture, coreset, CPU)
-    random = torch.Generator().manual_seed(0)
-    numbers = sum(prod(level) for level in architecture.levels[1:]) * 2
-    tables = torch.randn(numbers, generator=random)
-    bricks = torch.from_numpy(coreset.bricks.astype(np.int64))[:40]
-    lattices = upsampling.lattices(bricks)
-    levels = len(architecture.levels) - 1
-    embeddings = torch.empty(levels, 2, len(bricks), *coreset.brick_shape)
-    lattices.interpolate(tables[upsampling.used], embeddings)
-
-    inside = torch.cartesian_prod(*(torch.arange(n) for n in coreset.brick_shape))
-    space = bricks[:, None, 1:] * torch.tensor(coreset.brick_shape) + inside
-    points = torch.cat([bricks[:, None, :1].expand(-1, len(inside), 1), space], dim=2)
-    last = torch.tensor(architecture.sizes) - 1
-    points = torch.minimum(points, last).double().reshape(-1, 4)
-    start = 0
-    for level, out in zip(architecture.levels[1:], embeddings, strict=True):
-        table = tables[start : start + prod(level) * 2].view(-1, 2).double()
-        start += prod(level) * 2
-        expected = interpolate(table, points, architecture.sizes, level)
-        ours = out.flatten(2).permute(1, 2, 0).reshape(-1, 2)
-        torch.testing.assert_close(ours.double(), expected, rtol=1e-5, atol=1e-5)
-
-
-def test_the_transpose_is_the_transpose(noise_coreset) -> None:
-    coreset = noise_coreset((3, 9, 10, 20))
-    architecture = Architecture.for_box(coreset.box.shape, 3)
-    upsampling = Upsampling(architecture, coreset, CPU)
-    lattices = upsampling.lattices(torch.from_numpy(coreset.bricks.astype(np.int64)))
-    random = torch.Generator().manual_seed(0)
-    tables = torch.randn(len(upsampling.used), generator=random)
-    out = torch.empty(len(architecture.levels) - 1, 2, len(coreset.bricks), *coreset.brick_shape)
-    gradient = torch.randn(out.shape, generator=random)
-    lattices.interpolate(tables, out)
-    transposed = torch.zeros_like(tables)
-    lattices.add_transposed(transposed, gradient)
-    # <A tables, gradient> = <tables, A' gradient>
-    one = float((out.double() * gradient.double()).sum())
-    other = float((tables.double() * transposed.double()).sum())
-    size = float((out.double() * gradient.double()).abs().sum())
-    assert one == pytest.approx(other, abs=1e-6 * size)
-
-
-def test_a_step_is_that_of_torch() -> None:
-    random = torch.Generator().manual_seed(0)
-    ours = torch.randn(100, generator=random, dtype=torch.float64)
-    theirs = torch.nn.Parameter(ours.clone())
-    adam = torch.optim.Adam([theirs], lr=0.01, betas=(BETA1, BETA2), eps=EPSILON, fused=True)
-    mean, square = torch.zeros_like(ours), torch.zeros_like(ours)
-    for step in range(1, 6):
-        gradient = torch.randn(100, generator=random, dtype=torch.float64)
-        adam_step(ours, gradient, mean, square, step, 0.01)
-        theirs.grad = gradient
-        adam.step()
-    torch.testing.assert_close(ours, theirs.detach(), rtol=1e-10, atol=1e-12)
-
-
 def test_catching_up_equals_stepping_without_gradient() -> None:
     rates = 0.01 * (0.5 + 0.5 * np.cos(np.linspace(0, np.pi, 400)))
     visited = np.array([0, 1, 5, 100, 250, 299])
@@ -198,22 +132,6 @@ def test_catching_up_equals_stepping_without_gradient() -> None:
             )
             assert effect.mean_decay[number] == pytest.approx(mean / m, rel=1e-5, abs=1e-37)
             assert effect.square_decay[number] == pytest.approx(square / v, rel=1e-5)
-
-
-def test_numbers_that_catch_up_move_by_the_effect_and_their_moments_decay() -> None:
-    random = torch.Generator().manual_seed(2)
-    numbers = torch.rand(3, 2, 4, generator=random)
-    effect = catch_up(np.array([0, 3, 5, 9]), 9, np.full(10, 0.01))
-    factor, epsilon, mean_decay, square_decay = map(torch.from_numpy, effect)
-    parameter, mean, square = numbers.clone()
-    catch_up_numbers(numbers, torch.from_numpy(np.stack(effect)))
-    moved = parameter - factor * mean / (square.sqrt() + epsilon)
-    torch.testing.assert_close(numbers[0], moved)
-    torch.testing.assert_close(numbers[1], mean * mean_decay)
-    torch.testing.assert_close(numbers[2], square * square_decay)
-    # Without steps, or without a gradient before them, nothing changes.
-    assert torch.equal(numbers[0][:, [0, 3]], parameter[:, [0, 3]])
-    assert not torch.equal(numbers[0][:, 1], parameter[:, 1])
 
 
 MASKS = [[], [0], [1], [0, 1, 1, 0, 0, 1], [1, 1, 1], [0, 0, 0]]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,18 +13,12 @@ torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
 from engine_checks import assert_near
-from pretended_cuda import pretended_cuda
 from readable_paper import NaiveEngine
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten
 
-from fhash_codec.features.bricks import Coreset
 from fhash_codec.native import network
 from fhash_codec.native.network import PATHS, machine_paths
 from fhash_codec.paper.engines import make_engine, native
 from fhash_codec.paper.engines.native import Bricks, Gaps, Level, NativeEngine, refusal
-from fhash_codec.paper.engines.parameters import LIBRARIES, UNEVEN, needed_bytes
-from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import at_most
@@ -75,7 +67,7 @@ CASES = {
 def path(request: pytest.FixtureRequest) -> str:
     """Each path of the kernels; those that the machine lacks are skipped."""
     name: str = request.param
-    if name not in (*machine_paths(), "slab"):
+    if name not in machine_paths():
         pytest.skip(f"this machine has no {name}")
     return name
 
@@ -116,15 +108,12 @@ def oracle_of(model_of):
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("path", [*PATHS, "slab"], indirect=True)
+@pytest.mark.parametrize("path", PATHS, indirect=True)
 def test_it_trains_like_a_dense_adam_in_float64(model_of, oracle_of, path, case) -> None:
     """Though it visits few bricks a step."""
     coreset, architecture = model_of(case)
     first, batches, errors, expected = oracle_of(case)
-    if path == "slab":
-        engine = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU)
-    else:
-        engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
+    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
     values = engine.infer(np.arange(len(coreset.bricks)))
     assert values.shape == coreset.values.shape
     np.testing.assert_allclose(values, first, atol=3e-7)
@@ -139,11 +128,10 @@ def test_gradients_equal_those_of_autograd_in_float64(model_of, path) -> None:
     bricks = np.arange(len(coreset.bricks))
     engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
     oracle = NaiveEngine(architecture, coreset, RATES, seed=7)
-    used = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU).upsampling.used
     engine.train(bricks)
     oracle.train(bricks)
     tables = torch.cat([table.grad.flatten() for table in list(oracle.model.tables)[1:]])
-    parts = [tables[used]]
+    parts = [tables[engine._used]]
     for weight, bias in zip(oracle.model.weights, oracle.model.biases, strict=True):
         parts.append(torch.column_stack([weight.grad, bias.grad]))
     expected = torch.cat([part.flatten() for part in parts]).numpy()
@@ -168,25 +156,21 @@ def test_the_same_seed_path_and_threads_give_the_same_bits(model_of, path, count
 
 
 @pytest.mark.parametrize("case", ["plain", "a few vertices far apart", "no coarse levels"])
-def test_slab_and_native_go_on_from_each_other(model_of, case) -> None:
+def test_it_goes_on_from_the_state_of_an_engine_without_blocks(model_of, case) -> None:
+    """The state of the fused engine has none."""
     coreset, architecture = model_of(case)
     random, bricks = np.random.default_rng(1), len(coreset.bricks)
     batches = [random.permutation(bricks)[: max(1, bricks // 3)] for _ in range(30)]
-    slab = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU)
-    alternating = NativeEngine(architecture, coreset, RATES, seed=7)
+    straight = NativeEngine(architecture, coreset, RATES, seed=7)
+    interrupted = NativeEngine(architecture, coreset, RATES, seed=7)
     for step, batch in enumerate(batches):
-        if step in (10, 20):
-            other = (
-                SlabEngine(architecture, coreset, RATES, seed=1, device=CPU)
-                if step == 10
-                else NativeEngine(architecture, coreset, RATES, seed=2)
-            )
-            other.restore({name: array.copy() for name, array in alternating.state().items()})
-            alternating = other
-        error = float(slab.train(batch))
-        assert float(alternating.train(batch)) == pytest.approx(error, rel=1e-3, abs=1e-6)
-    assert alternating.name == "native"
-    assert_near(alternating.parameters(), slab.parameters())
+        if step == 10:
+            state = {name: array.copy() for name, array in interrupted.state().items()}
+            interrupted = NativeEngine(architecture, coreset, RATES, seed=1)
+            interrupted.restore({n: a for n, a in state.items() if n not in ("blocks", "behind")})
+        error = float(straight.train(batch))
+        assert float(interrupted.train(batch)) == pytest.approx(error, rel=1e-3, abs=1e-6)
+    assert_near(interrupted.parameters(), straight.parameters())
 
 
 def test_a_state_of_another_model_is_refused(model_of) -> None:
@@ -238,122 +222,8 @@ def test_constants_are_those_of_the_header(name) -> None:
     assert int(value.group(1)) == getattr(native, name)
 
 
-@pytest.fixture
-def engines_of(model_of):
-    """A function of a case: coreset, slab engine, and the oracle in float64."""
-
-    def make(case):
-        coreset, architecture = model_of(case)
-        slab = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU)
-        return coreset, slab, NaiveEngine(architecture, coreset, RATES, seed=7)
-
-    return make
-
-
-def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(engines_of) -> None:
-    _, slab, oracle = engines_of("a few vertices far apart")
-    coarse = sum(len(table) * 2 for table in list(oracle.model.tables)[1:])
-    assert 0 < len(slab.upsampling.used) < 0.6 * coarse
-    assert slab.parameters().coarse.size == coarse
-
-
-def test_samples_alone_give_the_same_gradients_as_all_vertices_of_sparse_bricks(
-    engines_of, monkeypatch
-) -> None:
-    shape, settings = (3, 9, 20, 35), {"embedding_size": 2, "hidden_layers": 2, "low": 0.8}
-    gradients, errors, moments = [], [], []
-    for full in (1.0, -1.0):
-        monkeypatch.setattr("fhash_codec.paper.engines.slab.FULL", full)
-        coreset, slab, _ = engines_of((shape, settings))
-        errors.append(float(slab.train(np.arange(len(coreset.bricks)))))
-        gradients.append(slab.gradient.clone())
-        moments.append(slab.fine_mean.clone())
-        # What stands for vertices that are no samples never moves.
-        assert not slab._numbers[..., -1].any()
-    assert errors[0] == pytest.approx(errors[1], rel=1e-6)
-    apart = (gradients[0] - gradients[1]).abs() / gradients[1].abs().max()
-    assert float(apart.max()) < 1e-5
-    apart = (moments[0] - moments[1]).abs() / moments[1].abs().max()
-    assert float(apart.max()) < 1e-5
-
-
-class Made(TorchDispatchMode):
-    """Counts the bytes of all tensors that are made, also of those that are freed again."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.bytes = 0
-
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        result = func(*args, **(kwargs or {}))
-        known = {id(each.untyped_storage()) for each in tensors(args)}
-        known |= {each.data_ptr() for each in tensors(args)}
-        for each in tensors(result):
-            self.bytes += each.nbytes if each.data_ptr() not in known else 0
-        return result
-
-
-def tensors(values: Any) -> list[torch.Tensor]:
-    return [each for each in tree_flatten(values)[0] if isinstance(each, torch.Tensor)]
-
-
-@pytest.mark.parametrize("low", [0.0, 0.7])
-@pytest.mark.parametrize("settings", [{"hidden_layers": 1, "width": 64}, {"hidden_layers": 2}])
-def test_a_training_needs_what_is_said(
-    noise_coreset: Callable[..., Coreset], settings: dict[str, int], low: float
-) -> None:
-    coreset = noise_coreset((3, 30, 40, 50), low)
-    architecture = Architecture.for_box(coreset.box.shape, 3, **{"width": 16, **settings})
-    bricks = len(coreset.bricks)
-    needed = needed_bytes(architecture, coreset, 8) - LIBRARIES
-    engine = SlabEngine(architecture, coreset, np.full(3, 0.01), seed=0, device=torch.device("cpu"))
-    every = tensors([*vars(engine).values(), *vars(engine.upsampling).values()])
-    # Some are views of the same memory.
-    storages = {each.data_ptr(): each for each in (t.untyped_storage() for t in every)}
-    held = sum(each.nbytes() for each in storages.values())
-    batch = np.arange(min(UNEVEN * -(-bricks // 8), bricks))
-    with Made() as made:
-        engine.train(batch)
-    assert held < needed
-    # Much of what a step makes is freed before its end.
-    assert 0.5 * (held + made.bytes) < needed < held + 2 * made.bytes
-
-
-SHAPES = [
-    pytest.param((3, 7, 10, 20), {}, 0.3, id="plain"),
-    pytest.param(
-        (1, 17, 16, 16),
-        {"embedding_size": 1, "hidden_layers": 0, "fold": 3},
-        0.3,
-        id="one key frame, linear readout",
-    ),
-    pytest.param((2, 5, 1, 1), {}, 0.3, id="a column"),
-    pytest.param((3, 30, 40, 50), {}, 0.9997, id="a few vertices far apart"),
-    pytest.param(
-        (3, 1, 33, 2), {"embedding_size": 3, "hidden_layers": 2}, 0.0, id="thin axes, all vertices"
-    ),
-]
-
-
-@pytest.mark.parametrize(("shape", "settings", "low"), SHAPES)
-def test_an_engine_trains_on_the_device_as_on_the_cpu(
-    noise_coreset: Callable[..., Coreset],
-    trained: Callable[..., Any],
-    shape: tuple[int, ...],
-    settings: dict[str, Any],
-    low: float,
-) -> None:
-    coreset = noise_coreset(shape, low)
-    here = trained(coreset, settings, "slab", "cpu")
-    with pretended_cuda() as pretended:
-        there = trained(coreset, settings, "slab", "cuda")
-    assert pretended.counts["launches"] > 0
-    assert there["error"] == pytest.approx(here["error"], rel=1e-3, abs=1e-6)
-    # By count: near a kink of a ReLU float32 may take the other side.
-    apart = np.abs(there["values"] - here["values"])
-    assert np.mean(apart > 1e-4) < 0.02
-    for part in ("fine", "coarse", "network"):
-        assert there[part].shape == here[part].shape
-        assert np.isfinite(there[part]).all()
+def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(model_of) -> None:
+    coreset, architecture = model_of("a few vertices far apart")
+    engine = NativeEngine(architecture, coreset, RATES, seed=7)
+    assert 0 < engine.coarse < 0.6 * architecture.coarse_numbers
+    assert engine.parameters().coarse.size == architecture.coarse_numbers

@@ -36,13 +36,13 @@ def emulated(library_folder):
 
 @pytest.fixture
 def engines_of(noise_coreset, emulated):
-    """A function of a shape, settings and a device: coreset, fused engine, slab, and the oracle."""
+    """A function of a shape, settings and a device: coreset, both engines, and the oracle."""
 
     import torch
     from readable_paper import NaiveEngine
 
     from fhash_codec.paper.engines.fused.engine import FusedEngine
-    from fhash_codec.paper.engines.slab import SlabEngine
+    from fhash_codec.paper.engines.native import NativeEngine
 
     def make(shape, settings, steps=40, **device):
         settings = dict(settings)
@@ -50,11 +50,13 @@ def engines_of(noise_coreset, emulated):
         settings = {"width": 16, **settings}
         architecture = Architecture.for_box(coreset.box.shape, shape[0], **settings)
         rates, cpu = np.full(steps + 1, 0.01), torch.device("cpu")
-        common = {"seed": 7, "device": cpu}
+        fused = FusedEngine(
+            architecture, coreset, rates, seed=7, device=cpu, kernels=emulated(**device)
+        )
         return (
             coreset,
-            FusedEngine(architecture, coreset, rates, kernels=emulated(**device), **common),
-            SlabEngine(architecture, coreset, rates, **common),
+            fused,
+            NativeEngine(architecture, coreset, rates, seed=7),
             NaiveEngine(architecture, coreset, rates, seed=7),
         )
 

@@ -1,4 +1,4 @@
-"""The tables of the kernels say what those of slab and of Adam's catching up say."""
+"""The tables of the kernels say what the matrices and Adam's catching up say."""
 
 from __future__ import annotations
 
