@@ -42,6 +42,7 @@ from fhash_codec.compact.tiles import (
     return_memory,
 )
 from fhash_codec.compact.transform import (
+    NONE,
     Magnitudes,
     in_plane,
     magnitudes_of,
@@ -55,7 +56,7 @@ from fhash_codec.compact.transform import (
 )
 from fhash_codec.progress import skip, stage, tell
 from fhash_formats.transform.spec import TransformSpec
-from fhash_formats.transform.tile_format import Shape, TileSettings
+from fhash_formats.transform.tile_format import TileSettings
 
 CODED_PART = 1 << 18
 """Vertices of a part that is coded."""
@@ -112,8 +113,8 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     tiled, settings, found = _priced(task, view, settings, density)
     if not complete and task.asks("filling"):
         task.parts.begin("fill values")
-        parts = coded_parts(task, tiled, settings)
         if masked:
+            parts = coded_parts(task, tiled, settings)
             share = _size_of(task, parts, settings, TRIAL_DENSITY) / _size_of(
                 task, parts, settings, 0
             )
@@ -123,7 +124,7 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
             if share < MISLED:
                 tiled, settings, found = _priced(task, view, settings, density)
         else:
-            settings = _deepened(task, tiled.tile, parts, settings)
+            settings = _deepened(task, tiled, settings)
     return _with_step(task, tiled, settings, found, density)
 
 
@@ -173,6 +174,8 @@ TRIAL_DENSITY = 2
 MISLED = 0.5
 """Share of the bytes that filled vertices leave below which prices of the values that were there
 chose other tiles: 7 % of the bytes where it is a third."""
+WHOLE_TILES = 5 << 18
+"""Vertices of the whole tiles on which deep wavelets are tried: parts of them foretell too much."""
 DEEP = 4
 """Levels of a deep wavelet along y and x."""
 
@@ -192,16 +195,23 @@ def _size_of(task: PlanTask, parts: Sample, settings: TileSettings, density: int
     return max(_at_promise(outcome, task.goal), 1.0)
 
 
-def _deepened(task: PlanTask, tile: Shape, parts: Sample, settings: TileSettings) -> TileSettings:
+def _deepened(task: PlanTask, tiled: Blocks, settings: TileSettings) -> TileSettings:
     """Return settings with deep wavelets where filled parts take fewer bytes by them.
 
     No price tells it: they leave hardly anything of a filling that was made for them. Where a file
     tells the values that are there, parts foretold it badly (20 % more bytes on one series).
     """
-    t, z, _, _ = settings.transform.axes
+    tile = tiled.tile
+    parts = Sample(tiled, WHOLE_TILES, task.workers, part_costs(task, tiled, settings))
+    t, z, y, x = settings.transform.axes
     plane = in_plane("9/7", DEEP, tile)
     along = (wavelet("9/7", 3, tile[0]), wavelet("9/7", 3, tile[1]))
-    trials = [settings.transform.axes, (t, z, plane[2], plane[3]), (*along, plane[2], plane[3])]
+    trials = [
+        settings.transform.axes,
+        (NONE, z, y, x),
+        (t, z, plane[2], plane[3]),
+        (*along, plane[2], plane[3]),
+    ]
     tried = [
         replace(settings, transform=TransformSpec(axes=axes)) for axes in dict.fromkeys(trials)
     ]
