@@ -53,7 +53,7 @@ def run(commands: list[list[str]], folder: Path) -> list[tuple[int, str, str]]:
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("plain")
-    t, z, y, x = np.meshgrid(*map(np.arange, (3, 6, 24, 24)), indexing="ij")
+    t, z, y, x = np.meshgrid(*map(np.arange, (6, 8, 32, 32)), indexing="ij")
     front = x + 0.6 * y - 2 * t + 4 * np.sin(z / 5 + t / 4) - 26
     np.save(folder / "data.npy", (1 / (1 + np.exp(-2 * front))).astype(np.float32))
     commands = {

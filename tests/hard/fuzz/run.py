@@ -46,7 +46,17 @@ TARGETS = tuple(
 SOURCES = (
     *("coder", "fast", "trellis", "mask", "mask_levels", "predict", "labels"),
     *("coder_v3", "fast_v3", "trellis_v3", "mask_v3", "predict_v3", "labels_v3"),
-    *("lifting", "head", "quantise", "values", "crc32c", "prior_bytes", "priors", "inflate"),
+    *(
+        "lifting",
+        "head",
+        "between",
+        "quantise",
+        "values",
+        "crc32c",
+        "prior_bytes",
+        "priors",
+        "inflate",
+    ),
     *(
         "settings",
         "basis",
