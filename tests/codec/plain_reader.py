@@ -3,11 +3,10 @@
 import numpy as np
 import zarr
 
-NEAR = [tuple(d * (a == b) for b in range(4)) for a in range(4) for d in (-1, 1)]
-FAR = [tuple(d * (a == b) for b in range(4)) for a in (0, 2, 3) for d in (-2, 2)]
-EDGES = [
-    np.insert([d, e], at, 0) for at in ([0, 0], [1, 1], [1, 2]) for d in (-1, 1) for e in (-1, 1)
-]
+S = (-1, 1)
+NEAR = [tuple(d * (a == b) for b in range(4)) for a in range(4) for d in S]
+FAR = [tuple(2 * d * (a == b) for b in range(4)) for a in (0, 2, 3) for d in S]
+EDGES = [np.insert([d, e], a, 0) for a in ([0, 0], [1, 1], [1, 2]) for d in S for e in S]
 f4 = np.float32
 
 
@@ -24,7 +23,7 @@ def occupied(bits, box):
 
 def shifted(values, offset):
     """Values at a neighbour (t, z, y, x) of each vertex, clamped to the tile."""
-    if len(values) == 1:  # of one step: what is along t is along z
+    if len(values) == 1:  # what is along t is along z
         offset = (0, offset[0] + offset[1], *offset[2:])
     axes = [np.clip(np.arange(n) + d, 0, n - 1) for n, d in zip(values.shape, offset, strict=True)]
     return values[np.ix_(*axes)]
