@@ -3,11 +3,10 @@
 import numpy as np
 import zarr
 
-S = (-1, 1)
+f4, S = np.float32, (-1, 1)
 NEAR = [tuple(d * (a == b) for b in range(4)) for a in range(4) for d in S]
 FAR = [tuple(2 * d * (a == b) for b in range(4)) for a in (0, 2, 3) for d in S]
 EDGES = [np.insert([d, e], a, 0) for a in ([0, 0], [1, 1], [1, 2]) for d in S for e in S]
-f4 = np.float32
 
 
 def occupied(bits, box):
