@@ -251,7 +251,9 @@ class BuildWasm(Command):
             *(path.name for path in FORMATS.glob("files/*.cpp")),
         )
         sources = [source for source in every if source.name not in others]
-        headers = max(path.stat().st_mtime for path in [*FORMATS.rglob("*.h*"), Path(__file__)])
+        # files.cpp includes those of files.
+        included = [*FORMATS.rglob("*.h*"), *FORMATS.glob("files/*.cpp"), Path(__file__)]
+        headers = max(path.stat().st_mtime for path in included)
 
         def compiled(source: Path) -> Path:
             result = build / f"{source.name}.o"

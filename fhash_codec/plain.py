@@ -332,7 +332,7 @@ def _described(head: NeighbourHead | None) -> dict[str, Any] | None:
     if head is None:
         return None
     return {
-        "hidden": list(head.hidden),
+        "widths": list(head.hidden),
         "sigma": head.sigma,
         "low": head.low,
         "high": head.high,

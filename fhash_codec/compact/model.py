@@ -178,7 +178,7 @@ def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> Neig
         return None
     layers = []
     try:
-        for number in range(1, len(described["hidden"]) + 2):
+        for number in range(1, len(described["widths"]) + 2):
             weights, biases = (
                 _integers(arrays[f"mlp/{kind}_{number}"]) for kind in ("weight", "bias")
             )

@@ -202,7 +202,7 @@ WRONG = {
     "profile": lambda model: model.update(
         profile="paper", fold=2, embedding_size=1, hidden_layers=0, width=1, tables="float32"
     ),
-    "hidden": lambda model: model["head"].update(hidden=[4, 3, 2, 1]),
+    "widths": lambda model: model["head"].update(widths=[4, 3, 2, 1]),
     "sigma": lambda model: model["head"].update(sigma=None),
 }
 
@@ -220,7 +220,7 @@ def test_a_header_that_does_not_fit_is_damage(tmp_path: Path) -> None:
             validate_header(wrong)
     for hidden, name in (([4, 2], "mlp/weight_2"), ([5, 3], "mlp/weight_1")):
         wrong = copy.deepcopy(header)
-        wrong["model"]["head"]["hidden"] = hidden
+        wrong["model"]["head"]["widths"] = hidden
         with pytest.raises(DamagedFileError, match=name):
             check_arrays(wrong, arrays)
     for name in ("mlp/bias_3", "tables/level_2", "occupancy/bits", "coords/x"):

@@ -686,10 +686,10 @@ def _check_plain(model: Record) -> None:
         return
     model.need(model.get("tables") == "float32", "tables", "float32 where there is a head")
     head = model.record("head")
-    hidden = head.get("hidden")
+    hidden = head.get("widths")
     count = len(hidden) if isinstance(hidden, list) else 0
-    head.need(1 <= count <= MAX_HIDDEN, "hidden", f"1 to {MAX_HIDDEN} widths")
-    head.integers("hidden", count, 1, MAX_HEAD_WIDTH)
+    head.need(1 <= count <= MAX_HIDDEN, "widths", f"1 to {MAX_HIDDEN} widths")
+    head.integers("widths", count, 1, MAX_HEAD_WIDTH)
     for key in ("sigma", "low", "high"):
         head.number(key)
 

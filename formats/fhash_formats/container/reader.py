@@ -142,7 +142,7 @@ def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
         head = model["head"]
         if head is None:
             return []
-        widths = [INPUTS, *head["hidden"], 1]
+        widths = [INPUTS, *head["widths"], 1]
     else:
         widths = [
             len(model["levels"]) * model["embedding_size"],

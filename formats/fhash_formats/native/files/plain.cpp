@@ -23,11 +23,11 @@ struct Widths {
 };
 
 bool read_widths(const Record& head, Widths& widths, fhash_error& error) {
-    const Json hidden = head.find("hidden");
+    const Json hidden = head.find("widths");
     const size_t count = yyjson_is_arr(hidden) ? yyjson_arr_size(hidden) : 0;
-    if (!head.need(count >= 1 && count <= 3, "hidden", "1 to 3 widths", error)) return false;
+    if (!head.need(count >= 1 && count <= 3, "widths", "1 to 3 widths", error)) return false;
     widths.hidden.resize(count);
-    return head.integers("hidden", count, 1, 64, widths.hidden.data(), error);
+    return head.integers("widths", count, 1, 64, widths.hidden.data(), error);
 }
 
 // All values of an array as whole multiples of its attribute `scale`.
