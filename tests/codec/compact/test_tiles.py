@@ -659,7 +659,7 @@ def test_parts_of_tables_are_parts_of_the_whole_and_integers_are_not_rounded(
 
 
 def test_a_head_that_is_no_head_is_damage() -> None:
-    model = {"head": {"hidden": [1], "sigma": 1.0, "low": 0.0, "high": 1.0}}
+    model = {"head": {"widths": [1], "sigma": 1.0, "low": 0.0, "high": 1.0}}
     assert head_of({"head": None}, {}) is None
 
     def array(name: str, values: object, scale: float) -> SimpleNamespace:
