@@ -29,6 +29,7 @@ from fhash_codec.compact.goal import (
     psnr_search,
     require_reach,
     search,
+    step_after_gain,
     with_step,
 )
 from fhash_codec.compact.head import head_bytes, training_device
@@ -495,6 +496,10 @@ def _search_psnr(
     return found if best is None or prefers(found, best) else best
 
 
+FAR_APART = 2.0
+"""dB by which two codings may differ so that their bytes compare by `EXCHANGE`."""
+
+
 def _head_holds(table: CodedTable, aim: _Aim, code_all: CodeAll) -> bool:
     """Whether the MLP of a table, if any, saves more bytes in all tiles than it takes.
 
@@ -503,9 +508,15 @@ def _head_holds(table: CodedTable, aim: _Aim, code_all: CodeAll) -> bool:
     """
     if table.plan.plain is None or table.plan.settings.head is None:
         return True
+    plain, reached = table.plan.plain, aim.psnr_of(table.outcome)
     with stage("coding", "gain of the MLP in all tiles"):
-        without = code_all(table.plan.plain).outcome
-    gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
+        without = code_all(plain).outcome
+        gain = reached - aim.psnr_of(without)
+        if abs(gain) > FAR_APART:
+            step = step_after_gain(plain.settings.step, -gain)
+            plain = replace(plain, settings=with_step(plain.settings, step, plain.goal))
+            without = code_all(plain).outcome
+            gain = reached - aim.psnr_of(without)
     return without.size * 2 ** (gain / EXCHANGE) > table.outcome.size + head_bytes(
         table.plan.settings.head
     )

@@ -114,8 +114,8 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     if not complete and task.asks("filling"):
         task.parts.begin("fill values")
         if masked:
-            parts = coded_parts(task, tiled, settings)
-            share = _size_of(task, parts, settings, TRIAL_DENSITY) / _size_of(
+            parts = _compared(task, tiled, settings)
+            share = _size_of(task, parts, settings, task.density) / _size_of(
                 task, parts, settings, 0
             )
             tell("filling", f"filled parts take {share:.2f} times the bytes")
@@ -124,7 +124,7 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
             if share < MISLED:
                 tiled, settings, found = _priced(task, view, settings, density)
         else:
-            settings = _deepened(task, tiled, settings)
+            settings = _deepened(task, _compared(task, tiled, settings), settings)
     return _with_step(task, tiled, settings, found, density)
 
 
@@ -169,24 +169,34 @@ def _with_step(
     return replace(attempt, tiling=tiling)
 
 
-TRIAL_DENSITY = 2
-"""Thoroughness of filling where its bytes are tried: more of it changed no choice."""
 MISLED = 0.5
 """Share of the bytes that filled vertices leave below which prices of the values that were there
 chose other tiles: 7 % of the bytes where it is a third."""
-WHOLE_TILES = 5 << 18
-"""Vertices of the whole tiles on which deep wavelets are tried: parts of them foretell too much."""
 DEEP = 4
 """Levels of a deep wavelet along y and x."""
 
 
+COMPARED_VERTICES = 5 << 18
+"""Vertices of the parts of tiles on which fillings are compared: half as many foretold badly."""
+
+
+def _compared(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
+    """Return parts of tiles, chosen by their costs, or tiles where none is larger."""
+    blocks = tiled.retile(sub_tile(tiled.tile, COMPARED_VERTICES))
+    costs = part_costs(task, blocks, settings)
+    return Sample(blocks, COMPARED_VERTICES, task.workers, costs, task.parts.tick)
+
+
 def _size_of(task: PlanTask, parts: Sample, settings: TileSettings, density: int) -> float:
-    """Return the bytes of parts where they keep the promise, by the plain quantiser.
+    """Return the bytes of parts where they keep the promise, with their mask.
 
     density: thoroughness of filling them; 0 for the values that are there.
     """
-    moved = moved_transform(parts, settings)
-    coding = task.goal.bounded(with_fill(coding_of(task.config.effort, fast=True)))
+    settings = with_mask(task, parts, settings, task.goal.expected_error)
+    coding = with_fill(coding_of(task.config.effort, fast=task.takes_fast_coder))
+    if allows_trellis(settings, task.goal, task.config.effort):
+        settings, coding = on_trellis(settings, coding)
+    moved, coding = moved_transform(parts, settings), task.goal.bounded(coding)
     filled = parts.filled(moved, density) if density else parts
     outcome = filled.run(moved, coding)
     if task.goal.psnr is not None:
@@ -195,14 +205,13 @@ def _size_of(task: PlanTask, parts: Sample, settings: TileSettings, density: int
     return max(_at_promise(outcome, task.goal), 1.0)
 
 
-def _deepened(task: PlanTask, tiled: Blocks, settings: TileSettings) -> TileSettings:
+def _deepened(task: PlanTask, parts: Sample, settings: TileSettings) -> TileSettings:
     """Return settings with deep wavelets where filled parts take fewer bytes by them.
 
     No price tells it: they leave hardly anything of a filling that was made for them. Where a file
     tells the values that are there, parts foretold it badly (20 % more bytes on one series).
     """
-    tile = tiled.tile
-    parts = Sample(tiled, WHOLE_TILES, task.workers, part_costs(task, tiled, settings))
+    tile = parts.blocks.tile
     t, z, y, x = settings.transform.axes
     plane = in_plane("9/7", DEEP, tile)
     along = (wavelet("9/7", 3, tile[0]), wavelet("9/7", 3, tile[1]))
@@ -215,7 +224,7 @@ def _deepened(task: PlanTask, tiled: Blocks, settings: TileSettings) -> TileSett
     tried = [
         replace(settings, transform=TransformSpec(axes=axes)) for axes in dict.fromkeys(trials)
     ]
-    return min(tried, key=lambda each: _size_of(task, parts, each, TRIAL_DENSITY))
+    return min(tried, key=lambda each: _size_of(task, parts, each, task.density))
 
 
 def coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
