@@ -266,6 +266,7 @@ def _trained(
             if coded is not alone:
                 corrected = _corrected(parts, alone, trained.head)
             coded = _left_to(corrected, parts, alone)
+            corrected = []  # as large as the sample: not held while the MLP learns
         trained = train_head(
             coded.pairs,
             coarser.low,
