@@ -169,7 +169,7 @@ def _with_step(
     return replace(attempt, tiling=tiling)
 
 
-MISLED = 0.5
+MISLED = 0.4
 """Share of the bytes that filled vertices leave below which prices of the values that were there
 chose other tiles: 7 % of the bytes where it is a third."""
 DEEP = 4
