@@ -17,7 +17,7 @@ import torch
 
 from fhash_bench.engines import GOALS, EngineFigures, EngineRun, Peak, Peaks, Variant, now
 from fhash_bench.rate.generated import DEFAULT, is_made, made_series
-from fhash_codec.boxes import Box, Sizes, TableSource
+from fhash_codec.boxes import Box, Sizes
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.cost.report import require_matplotlib
 from fhash_codec.devices import choose_device, machine, threads_for
@@ -72,7 +72,7 @@ def bench_points(
     tables = [
         ArrayTable(random.random((*level, size), dtype=np.float32)) for level in architecture.levels
     ]
-    network = _network(architecture, layers, tables)
+    network = Network.of(architecture, tables, layers)
     time = 0.37 * (network.key_frames - 1)
     box = architecture.box_size
     results: list[PointRate] = []
@@ -99,19 +99,6 @@ def bench_points(
                     }
                 )
     return results
-
-
-def _network(
-    architecture: Architecture, layers: Sequence[Layer], tables: Sequence[TableSource]
-) -> Network:
-    return Network(
-        levels=architecture.levels,
-        embedding_size=architecture.embedding_size,
-        tables=tables,
-        layers=tuple(layers),
-        box_size=architecture.box_size,
-        key_frames=architecture.key_frames,
-    )
 
 
 def _rays(box: Sizes) -> Points:
@@ -168,7 +155,7 @@ def bench_decode(
     """
     size = architecture.embedding_size
     tables = [_ZeroTable((*level, size)) for level in architecture.levels]
-    network = _network(architecture, layers, tables)
+    network = Network.of(architecture, tables, layers)
     every = -(-architecture.key_frames // KEY_FRAMES)
     keys = range(0, architecture.key_frames, every)
     masks = [unpack(coreset.occupancy[key], coreset.box.shape) for key in keys]

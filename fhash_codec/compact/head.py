@@ -119,8 +119,8 @@ def likely_widths(size: float, gain: float, access: str) -> Widths:
 def least_gain(task: PlanTask) -> float:
     """Return the gain in dB of least squares below which nothing is trained.
 
-    Who wishes for the fewest bytes pays the seconds of a training for little, and who asks for one
-    has it.
+    For the fewest bytes a training is worth its seconds for less, and one that is asked for is
+    made.
     """
     if task.config.train != "auto":
         return -math.inf

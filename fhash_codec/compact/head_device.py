@@ -17,8 +17,10 @@ from fhash_codec.compact.head_training import (
     ERROR_UNIT,
     MAX_ERROR,
     Batches,
+    Learn,
     Network,
     as_in_file,
+    native_learner,
 )
 from fhash_codec.devices import choose_device
 from fhash_formats.support.values import Double
@@ -44,13 +46,13 @@ EPSILON = 1e-8
 """Least divisor of a move, as Adam has it."""
 
 
-def learner_on(device: str) -> Callable[[Batches], Callable[..., None]]:
+def learner_on(device: str) -> Callable[[Batches], Learn]:
     """Return the learner of `train_head` on a device, 'cpu' or 'cuda', with the same bits.
 
     Raises MissingDependencyError without torch, InputError where there is no such device.
     """
     if device == "cpu":
-        return lambda voxels: Network.learn
+        return native_learner
     return lambda voxels: DeviceLearner(voxels, device).learn
 
 
@@ -66,17 +68,9 @@ class DeviceLearner:
         self._batches = len(voxels)
 
     def learn(
-        self,
-        network: Network,
-        voxels: Batches,
-        first: int,
-        rates: Double,
-        roots: Double,
-        *,
-        rounded: bool,
-        threads: int = 1,
+        self, network: Network, first: int, rates: Double, roots: Double, rounded: bool
     ) -> None:
-        """Do some updates, as `Network.learn` does. The batches are those on the device."""
+        """Do some updates, as a `Learn`."""
         for update, (rate, root) in enumerate(zip(rates, roots, strict=True), start=first):
             slopes = self._gradient(network, update % self._batches, rounded=rounded)
             _adam_step(network, slopes, float(rate), float(root))

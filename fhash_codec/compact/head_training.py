@@ -393,6 +393,21 @@ def weights_of(widths: tuple[int, int]) -> int:
     return INPUTS * first + first * second + second
 
 
+Learn = Callable[[Network, int, Double, Double, bool], None]
+"""Function that does some updates by the batches that it holds: of a network, from the number of
+the first one on, with their `adam_factors`, rounded as in the file or not (`Network.learn`)."""
+
+
+def native_learner(voxels: Batches) -> Learn:
+    """Return what learns from some batches by the native code, with all threads."""
+
+    def learn(network: Network, first: int, rates: Double, roots: Double, rounded: bool) -> None:
+        threads = usable_threads()
+        network.learn(voxels, first, rates, roots, rounded=rounded, threads=threads)
+
+    return learn
+
+
 @dataclass(frozen=True, kw_only=True)
 class Budget:
     """Length of the training of a head, and what trains it."""
@@ -406,8 +421,8 @@ class Budget:
     rate: float = 1e-2
     """Highest learning rate. A short training gains as much as one of twice its length where it
     learns three times as fast; a long one does not."""
-    learner: Callable[[Batches], Callable[..., None]] = lambda voxels: Network.learn
-    """Function of some batches, whose result does updates by them as `Network.learn` does."""
+    learner: Callable[[Batches], Learn] = native_learner
+    """Function of the batches that are learned from."""
 
 
 def train_head(
@@ -450,7 +465,7 @@ def train_head(
         networks[0].parameters[:] = start.parameters
     learn = budget.learner(training)
     rates = _rates(budget.updates, budget.rate)
-    history, network = _optimise(networks, learn, training, held_out, rates, progress)
+    history, network = _optimise(networks, learn, held_out, rates, progress)
     head = NeighbourHead(
         layers=network.layers(),
         sigma=float(sigma),
@@ -530,8 +545,7 @@ def _sigma(drawn: Sequence[Voxels]) -> np.float32:
 
 def _optimise(
     networks: list[Network],
-    learn: Callable[..., None],
-    training: Batches,
+    learn: Learn,
     held_out: Batches,
     rates: Double,
     progress: Callable[[float], None] | None,
@@ -540,7 +554,6 @@ def _optimise(
 
     The gains are tuples (seconds, update, dB).
 
-    learn: does some updates, as `Network.learn` does.
     rates: learning rate of each update.
     """
     history: list[tuple[float, int, float]] = []
@@ -555,15 +568,7 @@ def _optimise(
     began, done = perf_counter(), 0
     for pause in sorted(pauses - {0}):
         for network in networks:
-            learn(
-                network,
-                training,
-                done + 1,
-                factors[done:pause],
-                roots[done:pause],
-                rounded=done >= unrounded,
-                threads=usable_threads(),
-            )
+            learn(network, done + 1, factors[done:pause], roots[done:pause], done >= unrounded)
         done = pause
         if done == chosen:
             gains = [_gain(network, held_out, rounded=False) for network in networks]

@@ -408,8 +408,6 @@ def psnr(data_range: float, rmse: float | None) -> float | None:
 
 ONE_IN = 100
 """Values of which one is left out at either end of the bulk."""
-BULK_SHARE = 0.98
-"""Share of the values that lie in the bulk, at least."""
 BINS = 1 << 16
 """Bins of the histogram that the ends of the bulk are found by."""
 MIN_BINS = 1 << 10

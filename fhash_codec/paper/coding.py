@@ -201,14 +201,7 @@ class ModelCoding:
         tables = trained_tables(architecture, coreset, Bricks(coreset), model.fine, model.tables)
 
         def network(layers: Sequence[Layer]) -> Network:
-            return Network(
-                levels=architecture.levels,
-                embedding_size=architecture.embedding_size,
-                tables=tables,
-                layers=tuple(layers),
-                box_size=architecture.box_size,
-                key_frames=architecture.key_frames,
-            )
+            return Network.of(architecture, tables, layers)
 
         exact = samples.error(network(model.layers))
         allowed = 0.0 if psnr is None else 10 ** (-psnr / 10)

@@ -373,6 +373,20 @@ class Network:
     box_size: tuple[int, int, int]
     key_frames: int
 
+    @classmethod
+    def of(
+        cls, architecture: Architecture, tables: Sequence[TableSource], layers: Sequence[Layer]
+    ) -> Network:
+        """Return the network of an architecture with these tables and layers."""
+        return cls(
+            levels=architecture.levels,
+            embedding_size=architecture.embedding_size,
+            tables=tables,
+            layers=tuple(layers),
+            box_size=architecture.box_size,
+            key_frames=architecture.key_frames,
+        )
+
     def __post_init__(self) -> None:
         self._check_tables()
         self._check_layers()

@@ -142,7 +142,7 @@ def test_a_device_trains_the_same_bits(rounded: bool) -> None:
     data = voxels(2, 3)
     here, there = network(), network()
     here.learn(data, 1, *factors(30), rounded=rounded)
-    DeviceLearner(data, "cpu").learn(there, data, 1, *factors(30), rounded=rounded)
+    DeviceLearner(data, "cpu").learn(there, 1, *factors(30), rounded)
     for name in ("parameters", "means", "squares"):
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
 
