@@ -82,6 +82,7 @@ std::int64_t fhash_trellis_choose_f32(const float*, FHASH_TRELLIS_TABLE, const s
                                       const std::int32_t*, std::int32_t*);
 std::int64_t fhash_trellis_choose_f64(const double*, FHASH_TRELLIS_TABLE, const std::uint8_t*,
                                       const std::int32_t*, std::int32_t*);
+void fhash_price(const float*, std::int64_t, double, double*);
 std::int64_t fhash_quantise_f32(const float*, std::int64_t, double, double, double, std::int32_t*,
                                 float*);
 std::int64_t fhash_quantise_f64(const double*, std::int64_t, double, double, double,

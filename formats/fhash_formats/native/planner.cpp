@@ -1,7 +1,7 @@
 // The planner: tiles, transform and step of a series by prices of some of its parts.
 //
-// Nothing is coded. A price is what the fast coder would take for the coefficients of a part, and
-// their squared error (fast.cpp). All trials are priced on a quarter of the parts, and those that
+// Nothing is coded. A price is the bits that the coefficients of a part are likely to take, and
+// their squared error (fhash_price). All trials are priced on a quarter of the parts, and those that
 // come near the cheapest on all of them.
 #include <algorithm>
 #include <cmath>
@@ -325,22 +325,24 @@ class Planner {
 
     // Prices of transforms on blocks; for all that these stand for. The costs are with the bytes of
     // bases for tiles of a shape. What all trials do alike is done once for each block.
+    //
+    // likely: by the coefficients alone, whatever stands around each.
     bool price(const Set& set, const std::vector<size_t>& which, const Shape& tile,
-               const std::vector<Kinds>& trials, Price* prices) {
+               const std::vector<Kinds>& trials, Price* prices, bool likely = false) {
         const Blocks& blocks = set.blocks;
         const size_t count = trials.size(), jobs = count * which.size();
         std::vector<Settings> settings(count);
-        std::vector<Table> tables;
         Settings common;
         const int axes = varied(trials);
         for (size_t i = 0; i < count; i++) {
             prices[i] = {};
             prices[i].bytes = fit(trials[i], blocks.shape, tile, settings[i].axes);
-            tables.push_back(band_table(settings[i].axes, blocks.shape));
             for (int a = 0; a < 4 && axes; a++)
                 if (!(axes >> a & 1)) common.axes[a] = std::exchange(settings[i].axes[a], {});
         }
         std::vector<double> results(2 * jobs);
+        const int64_t n = vertices(blocks.shape);
+        const FastPrior& prior = fast_prior();
         std::vector<std::vector<float>> held(axes ? which.size() : 0);
         const auto transform = [&](const Settings& of, const std::vector<float>& values,
                                    std::vector<float>& to) {
@@ -350,7 +352,6 @@ class Planner {
             to.resize(values.size());
             return plan && plan->transform(values.data(), to.data()) >= 0;
         };
-        const FastPrior& prior = fast_prior();
         const bool done =
             in_threads(held.size(),
                        [&](size_t place, std::vector<float>&) {
@@ -358,23 +359,29 @@ class Planner {
                        }) &&
             in_threads(jobs, [&](size_t job, std::vector<float>& coefficients) {
                 const size_t i = job / which.size(), place = job % which.size();
-                const int64_t bands = (int64_t)tables[i].size() / TABLE_COLUMNS;
-                return transform(settings[i], axes ? held[place] : blocks.all[which[place]].values,
-                                 coefficients) &&
-                       fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
-                                         blocks.shape.data(), tables[i].data(), bands,
+                if (!transform(settings[i], axes ? held[place] : blocks.all[which[place]].values,
+                               coefficients))
+                    return false;
+                double* const result = &results[2 * job];
+                if (likely) {
+                    fhash_price(coefficients.data(), n, 1 / step_, result);
+                    return true;
+                }
+                const Table table = band_table(settings[i].axes, blocks.shape);
+                return fhash_fast_encode(nullptr, coefficients.data(), 0, 1 / step_, WEIGHT,
+                                         blocks.shape.data(), table.data(),
+                                         (int64_t)table.size() / TABLE_COLUMNS,
                                          prior.slots.data(), prior.defaults.data(), nullptr, 0,
-                                         &results[2 * job]) >= 0;
+                                         result) >= 0;
             });
         if (!done) return fail(error_, FHASH_ERROR_MEMORY, "a price could not be computed");
-        const double n = (double)vertices(blocks.shape);
         for (size_t job = 0; job < jobs; job++) {
             const Block& block = blocks.all[which[job % which.size()]];
             Price& of = prices[job / which.size()];
             const double squares = results[2 * job + 1] * step_ * step_;
             of.bytes += block.weight * results[2 * job];
             of.squares += block.weight * block.share * squares;
-            of.count += block.weight * block.share * n;
+            of.count += block.weight * block.share * (double)n;
         }
         return true;
     }
@@ -397,7 +404,7 @@ class Planner {
         std::vector<std::pair<double, size_t>> costs;
         for (const size_t number : set.all) {
             Price one;
-            if (!price(set, {number}, set.shape(), {kinds}, &one)) return false;
+            if (!price(set, {number}, set.shape(), {kinds}, &one, true)) return false;
             costs.emplace_back(-one.bytes, number);
         }
         std::sort(costs.begin(), costs.end());
@@ -416,25 +423,19 @@ class Planner {
                 trials.push_back(other);
         if (trials.size() == 1) return true;
         std::vector<Price> prices(trials.size());
-        const auto run = [&](const std::vector<size_t>& which) {
-            return price(set, which, tile, trials, prices.data());
-        };
         const auto least = [&] {
             double lowest = cost(prices[0]);
             for (const Price& one : prices) lowest = std::min(lowest, cost(one));
             return lowest;
         };
-        if (set.few.size() < set.all.size()) {
-            if (!run(set.few)) return false;
-            const double limit = NEAR * least();
-            std::vector<Kinds> near;
-            for (size_t i = 0; i < trials.size(); i++)
-                if (i == 0 || cost(prices[i]) <= limit) near.push_back(trials[i]);
-            trials = near;
-            prices.resize(trials.size());
-        }
-        if (trials.size() == 1) return true;
-        if (!run(set.all)) return false;
+        if (!price(set, set.few, tile, trials, prices.data(), true)) return false;
+        const double limit = NEAR * least();
+        std::vector<Kinds> near;
+        for (size_t i = 0; i < trials.size(); i++)
+            if (cost(prices[i]) <= limit) near.push_back(trials[i]);
+        trials = near;
+        prices.resize(trials.size());
+        if (trials.size() > 1 && !price(set, set.all, tile, trials, prices.data())) return false;
         const double lowest = least();
         for (size_t i = 0; i < trials.size(); i++)
             if (cost(prices[i]) == lowest) {
@@ -512,7 +513,7 @@ class Planner {
         double fine = -1e9, coarse = 1e9;
         for (int i = 0; i < MOST_SETTLED; i++) {
             Price found;
-            if (!price(set, set.all, set.shape(), {kinds}, &found)) return false;
+            if (!price(set, set.all, set.shape(), {kinds}, &found, true)) return false;
             double wanted;  // change of the logarithm of the step
             if (task_.size > 0) {
                 wanted = std::log2(std::max(found.bytes, 1.0) / task_.size) / FALL;

@@ -1,12 +1,44 @@
 // Coefficients to integers and back, element by element.
 #include "loops.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include "core.hpp"
 
 namespace {
+
+// A coefficient of a steps is likely to take 2 log2(1 + a / 0.8) bits, whatever stands around it:
+// of the transforms of 20 series it chooses those of which the fast coder takes 0.1 % more bytes.
+constexpr float BITS = 2, OF_STEP = 1 / 0.8F;
+constexpr float DEAD_ZONE = 0.62F;  // steps below which a coefficient becomes 0
+constexpr float LARGEST = 1 << 22;  // steps from which on a coefficient has no further bits
+// Sums are of integers, whose order changes nothing, and of so many that they fit.
+constexpr std::int64_t SUMMED = 1 << 14;
+constexpr int LOG_BITS = 12, SQUARE_BITS = 16;
+
+// Adds the bits and squared errors, in squared steps, that coefficients times a scale have.
+FHASH_CLONES void price_cloned(const float* in, std::int64_t n, float scale, std::int64_t* sums) {
+    for (std::int64_t first = 0; first < n; first += SUMMED) {
+        const std::int64_t last = std::min(first + SUMMED, n);
+        std::int32_t bits = 0, squares = 0;
+        for (std::int64_t i = first; i < last; i++) {
+            const float scaled = std::fabs(in[i] * scale);
+            const float a = scaled < LARGEST ? scaled : LARGEST;
+            const float more = 1 + a * OF_STEP;
+            std::int32_t of_more;  // 127 + log2, within 0.09, times 2^23
+            std::memcpy(&of_more, &more, sizeof of_more);
+            bits += (of_more - 0x3f800000) >> (23 - LOG_BITS);
+            const float whole = (float)(std::int32_t)(a + 0.5F);
+            const float error = a < DEAD_ZONE ? a : a - whole;
+            squares += (std::int32_t)(error * error * (1 << SQUARE_BITS));
+        }
+        sums[0] += bits;
+        sums[1] += squares;
+    }
+}
 
 template <class T>
 FHASH_INLINE void quantise(const T* in, std::int64_t count, T scale, T rounding, T largest,
@@ -51,6 +83,15 @@ FHASH_CLONED(float)
 FHASH_CLONED(double)
 
 }  // namespace
+
+// A price of n coefficients times a scale, in steps: bytes, and the sum of the squared errors in
+// squared steps. The bits are alike on every processor.
+FHASH_KERNEL void fhash_price(const float* in, std::int64_t n, double scale, double* price) {
+    std::int64_t sums[2] = {0, 0};
+    price_cloned(in, n, (float)scale, sums);
+    price[0] = BITS / 8 * (double)sums[0] / (1 << LOG_BITS);
+    price[1] = (double)sums[1] / (1 << SQUARE_BITS);
+}
 
 FHASH_KERNEL std::int64_t fhash_quantise_f32(const float* in, std::int64_t n, double scale,
                                              double rounding, double largest, std::int32_t* out,
