@@ -7,7 +7,7 @@ and whether vertices that do not count are filled.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import prod
 from typing import NamedTuple
 
@@ -108,24 +108,26 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     settings: with a first guess of the step.
     """
     task.parts.begin("tiles and transform")
-    view, complete, masked = in_part(task.blocks), task.blocks.complete, task.blocks.masked
-    density = 0 if complete or masked else task.density
+    view, masked = in_part(task.blocks), task.blocks.masked
+    density = 0 if task.blocks.complete or masked else task.density
     tiled, settings, found = _priced(task, view, settings, density)
-    if not complete and task.asks("filling"):
-        task.parts.begin("fill values")
-        if masked:
-            parts = _compared(task, tiled, settings)
-            share = _size_of(task, parts, settings, task.density) / _size_of(
-                task, parts, settings, 0
-            )
-            tell("filling", f"filled parts take {share:.2f} times the bytes")
-            density = task.density if share < 1 else 0
-            found = replace(found, size=min(share, 1.0) * found.size)
-            if share < MISLED:
-                tiled, settings, found = _priced(task, view, settings, density)
-        else:
-            settings = _deepened(task, _compared(task, tiled, settings), settings)
-    return _with_step(task, tiled, settings, found, density)
+    if task.blocks.complete or not task.asks("filling"):
+        return _with_step(task, found, _coded_parts(task, tiled, settings, density))
+    task.parts.begin("fill values")
+    parts = _parts_of(task, tiled, settings, COMPARED_VERTICES, COMPARED_VERTICES)
+    if not masked:
+        return _with_step(task, found, _deepened(task, tiled, parts, settings))
+    there, filled = (
+        _at_step(task, CodedParts.of(task, tiled, parts, settings, each))
+        for each in (0, task.density)
+    )
+    share = filled.size(task) / there.size(task)
+    tell("filling", f"filled parts take {share:.2f} times the bytes")
+    found = replace(found, size=min(share, 1.0) * found.size)
+    if share >= MISLED:
+        return _with_step(task, found, filled if share < 1 else there)
+    tiled, settings, found = _priced(task, view, settings, task.density)
+    return _with_step(task, found, _coded_parts(task, tiled, settings, task.density))
 
 
 def _priced(
@@ -143,28 +145,15 @@ def _priced(
     return found
 
 
-def _with_step(
-    task: PlanTask, tiled: Blocks, settings: TileSettings, found: Priced, density: int
-) -> Attempt:
-    """Return a plan by prices with its coder and its step, by coded parts.
-
-    density: as in `_priced`.
-    """
-    goal, config = task.goal, task.config
+def _with_step(task: PlanTask, found: Priced, coded: CodedParts) -> Attempt:
+    """Return a plan by prices with its coder and its step, by coded parts."""
+    config = task.config
     tiling = None
     if task.fixed_tile is None and config.effort > 1:
         tiling = Tiling(tile=found.tile, price=found.price, tried=found.tried)
         tell("plan", f"--preset {config.preset}: {tiling.describe()}")
-    coding = coding_of(
-        config.effort,
-        filled=density == 0,
-        density=density,
-        bulk=goal.bulk,
-        fast=task.takes_fast_coder,
-    )
     with stage("step", "coder and step, by coding some parts"):
-        parts = coded_parts(task, tiled, settings)
-        attempt = _coded(task, settings, coding, tiled, parts, found.size)
+        attempt = _coded(task, coded, found.size)
     task.gains.note("transform by trial", attempt.outcome)
     return replace(attempt, tiling=tiling)
 
@@ -174,39 +163,91 @@ MISLED = 0.4
 chose other tiles: 7 % of the bytes where it is a third."""
 DEEP = 4
 """Levels of a deep wavelet along y and x."""
-
-
 COMPARED_VERTICES = 5 << 18
 """Vertices of the parts of tiles on which fillings are compared: half as many foretold badly."""
 
 
-def _compared(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
-    """Return parts of tiles, chosen by their costs, or tiles where none is larger."""
-    blocks = tiled.retile(sub_tile(tiled.tile, COMPARED_VERTICES))
-    costs = part_costs(task, blocks, settings)
-    return Sample(blocks, COMPARED_VERTICES, task.workers, costs, task.parts.tick)
+@dataclass(frozen=True, kw_only=True)
+class CodedParts:
+    """Some parts of tiles, as they are coded with the settings of these."""
+
+    tiled: Blocks
+    """The series in its tiles."""
+    settings: TileSettings
+    """Settings of the tiles."""
+    coding: Coding
+    """Options of the encoder, without the bound."""
+    parts: Sample
+    """Parts of the tiles, filled where the coding says so."""
+    moved: TileSettings
+    """Settings of the parts."""
+
+    @classmethod
+    def of(
+        cls, task: PlanTask, tiled: Blocks, parts: Sample, settings: TileSettings, density: int
+    ) -> CodedParts:
+        """Return parts, filled with the density; with 0 they keep the values that are there.
+
+        settings: of the plain quantiser.
+        """
+        goal, config = task.goal, task.config
+        coding = coding_of(
+            config.effort,
+            filled=density == 0,
+            density=density,
+            bulk=goal.bulk,
+            fast=task.takes_fast_coder,
+        )
+        settings = with_mask(task, parts, settings, goal.expected_error)
+        if allows_trellis(settings, goal, config.effort):
+            settings, coding = on_trellis(settings, coding)
+        moved = moved_transform(parts, settings)
+        parts = parts.filled(moved, density)
+        return cls(tiled=tiled, settings=settings, coding=coding, parts=parts, moved=moved)
+
+    def run(self, task: PlanTask) -> Outcome:
+        """Return the outcome of the parts."""
+        return self.parts.run(self.moved, task.goal.bounded(with_fill(self.coding)))
+
+    def size(self, task: PlanTask) -> float:
+        """Return the bytes of the parts where they keep the promise, with their mask."""
+        return max(_at_promise(self.run(task), task.goal), 1.0)
+
+    def with_step(self, step: float, goal: Goal) -> CodedParts:
+        """Return the same parts with another step."""
+        settings = with_step(self.settings, step, goal)
+        moved = replace(self.moved, step=settings.step, double=settings.double)
+        return replace(self, settings=settings, moved=moved)
 
 
-def _size_of(task: PlanTask, parts: Sample, settings: TileSettings, density: int) -> float:
-    """Return the bytes of parts where they keep the promise, with their mask.
+def _coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings, density: int) -> CodedParts:
+    """Return the parts that tell coder and step. Arguments as those of `CodedParts.of`."""
+    parts = _parts_of(task, tiled, settings, CODED_PART, CODED_VERTICES)
+    return CodedParts.of(task, tiled, parts, settings, density)
 
-    density: thoroughness of filling them; 0 for the values that are there.
+
+def _parts_of(
+    task: PlanTask, tiled: Blocks, settings: TileSettings, each: int, together: int
+) -> Sample:
+    """Return parts of tiles, or tiles where none is larger, chosen by their costs.
+
+    each, together: vertices of a part, and of all, at most.
     """
-    settings = with_mask(task, parts, settings, task.goal.expected_error)
-    coding = with_fill(coding_of(task.config.effort, fast=task.takes_fast_coder))
-    if allows_trellis(settings, task.goal, task.config.effort):
-        settings, coding = on_trellis(settings, coding)
-    moved, coding = moved_transform(parts, settings), task.goal.bounded(coding)
-    filled = parts.filled(moved, density) if density else parts
-    outcome = filled.run(moved, coding)
-    if task.goal.psnr is not None:
-        step = step_after(moved, outcome, task.goal)
-        outcome = filled.run(replace(moved, step=step), coding)
-    return max(_at_promise(outcome, task.goal), 1.0)
+    blocks = tiled.retile(sub_tile(tiled.tile, each))
+    return Sample(
+        blocks, together, task.workers, part_costs(task, blocks, settings), task.parts.tick
+    )
 
 
-def _deepened(task: PlanTask, parts: Sample, settings: TileSettings) -> TileSettings:
-    """Return settings with deep wavelets where filled parts take fewer bytes by them.
+def _at_step(task: PlanTask, coded: CodedParts) -> CodedParts:
+    """Return parts at a step that is nearer to a promised PSNR."""
+    if task.goal.psnr is None or task.goal.data_range <= 0:
+        return coded
+    return coded.with_step(step_after(coded.moved, coded.run(task), task.goal), task.goal)
+
+
+def _deepened(task: PlanTask, tiled: Blocks, parts: Sample, settings: TileSettings) -> CodedParts:
+    """Return filled parts with deep wavelets where they take fewer bytes by them.
 
     No price tells it: they leave hardly anything of a filling that was made for them. Where a file
     tells the values that are there, parts foretold it badly (20 % more bytes on one series).
@@ -221,17 +262,11 @@ def _deepened(task: PlanTask, parts: Sample, settings: TileSettings) -> TileSett
         (t, z, plane[2], plane[3]),
         (*along, plane[2], plane[3]),
     ]
-    tried = [
-        replace(settings, transform=TransformSpec(axes=axes)) for axes in dict.fromkeys(trials)
-    ]
-    return min(tried, key=lambda each: _size_of(task, parts, each, task.density))
-
-
-def coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Sample:
-    """Return the parts of the tiles that are coded."""
-    blocks = tiled.retile(sub_tile(tiled.tile, CODED_PART))
-    costs = part_costs(task, blocks, settings)
-    return Sample(blocks, CODED_VERTICES, task.workers, costs, task.parts.tick)
+    tried = []
+    for axes in dict.fromkeys(trials):
+        of_axes = replace(settings, transform=TransformSpec(axes=axes))
+        tried.append(_at_step(task, CodedParts.of(task, tiled, parts, of_axes, task.density)))
+    return min(tried, key=lambda each: each.size(task))
 
 
 def with_fill(coding: Coding) -> Coding:
@@ -250,37 +285,20 @@ def with_mask(task: PlanTask, sample: Sample, settings: TileSettings, error: flo
     return replace(settings, mask=levels)
 
 
-def _coded(
-    task: PlanTask,
-    settings: TileSettings,
-    coding: Coding,
-    tiled: Blocks,
-    parts: Sample,
-    size: float,
-) -> Attempt:
+def _coded(task: PlanTask, coded: CodedParts, size: float) -> Attempt:
     """Return the plan with the better coder, at the step that should keep the promise.
 
-    settings: of the plain quantiser.
-    parts: coded for the choice.
     size: bytes of all tiles by price.
     """
-    goal, sample, predicted = task.goal, Sample(tiled, 1, task.workers), PredictedError()
-    settings = with_mask(task, parts, settings, goal.expected_error)
-    moved = moved_transform(parts, settings)
-    parts = parts.filled(moved, coding.density)
-    if allows_trellis(settings, goal, task.config.effort):
-        settings, coding = on_trellis(settings, coding)
-        moved, _ = on_trellis(moved, coding)
+    goal, parts, tiled, predicted = task.goal, coded.parts, coded.tiled, PredictedError()
     if task.config.effort > 1 and task.is_slow(tiled.tile, size):
-        coding, outcome = _with_coder(task, moved, coding, parts, size)
-    else:
-        outcome = parts.run(moved, goal.bounded(with_fill(coding)))
+        coded = _with_coder(task, coded, size)
+    settings, moved, coding = coded.settings, coded.moved, coded.coding
+    outcome = coded.run(task)
     if goal.data_range <= 0:
         pass  # any step gives the one value that there is
     elif goal.psnr is not None:
-        settings, moved, outcome, predicted = _promised_step(
-            task, settings, moved, tiled, parts, outcome, coding
-        )
+        settings, moved, outcome, predicted = _promised_step(task, coded, outcome)
         if tiled.complete and may_aim(task, settings, coding):
             coding = replace(coding, aim=predicted.ratio)
     else:
@@ -289,9 +307,14 @@ def _coded(
         if outcome.count:
             error = math.sqrt(outcome.squares / outcome.count)
             settings = with_mask(task, parts, settings, error)
+    sample = Sample(tiled, 1, task.workers)
+    if parts.blocks.tile == tiled.tile:  # what was measured is what is coded
+        settings = replace(settings, transform=moved.transform)
+    else:
+        settings = refit(sample, settings)
     return Attempt(
         sample=sample,
-        settings=refit(sample, settings),
+        settings=settings,
         outcome=outcome,
         coding=coding,
         parts=parts,
@@ -322,21 +345,17 @@ def of_filled_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     return replace(attempt, settings=settings, coding=coding, magnitudes=series)
 
 
-def _with_coder(
-    task: PlanTask, moved: TileSettings, coding: Coding, parts: Sample, size: float
-) -> tuple[Coding, Outcome]:
-    """Return the coding by the fast coder where it takes few enough bytes, and its outcome.
+def _with_coder(task: PlanTask, coded: CodedParts, size: float) -> CodedParts:
+    """Return the parts by the fast coder where it takes few enough bytes.
 
-    moved: settings of the parts, which are coded.
-    coding: by the other coder.
+    coded: by the other coder.
     size: bytes of all tiles, approximately.
     """
-    goal, faster = task.goal, replace(coding, fast=True)
-    slow, fast = (parts.run(moved, goal.bounded(with_fill(each))) for each in (coding, faster))
-    ratio = _at_promise(fast, goal) / max(_at_promise(slow, goal), 1.0)
+    fast = replace(coded, coding=replace(coded.coding, fast=True))
+    ratio = fast.size(task) / coded.size(task)
     most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
     tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
-    return (faster, fast) if ratio <= most else (coding, slow)
+    return fast if ratio <= most else coded
 
 
 class PredictedError(NamedTuple):
@@ -349,34 +368,26 @@ class PredictedError(NamedTuple):
 
 
 def _promised_step(
-    task: PlanTask,
-    settings: TileSettings,
-    moved: TileSettings,
-    tiled: Blocks,
-    parts: Sample,
-    outcome: Outcome,
-    coding: Coding,
+    task: PlanTask, coded: CodedParts, outcome: Outcome
 ) -> tuple[TileSettings, TileSettings, Outcome, PredictedError]:
     """Return settings of a step that should give the promised PSNR, of tiles and of parts.
 
     The outcome is what is expected of all tiles.
 
-    moved: settings of the parts.
-    outcome: of the parts, with these.
+    outcome: of the parts.
     """
-    goal = task.goal
+    goal, parts = task.goal, coded.parts
     assert goal.psnr is not None
-    for _ in range(LOOKS):
-        step, predicted = _step(task, settings, moved, tiled, parts, outcome)
+    for look in range(LOOKS + 1):
+        settings, moved = coded.settings, coded.moved
+        step, predicted = _step(task, settings, moved, coded.tiled, parts, outcome)
         change = min(max(step / settings.step, 1 / FARTHEST), FARTHEST)
-        if abs(math.log(change)) < NEAR:
+        if look == LOOKS or abs(math.log(change)) < NEAR:
             break
         # So far from where it was measured, coefficients foretell the error badly.
-        settings = with_step(settings, change * settings.step, goal)
-        moved = moved_transform(parts, replace(moved, step=settings.step, double=settings.double))
-        outcome = parts.run(moved, with_fill(coding))
-    else:
-        step, predicted = _step(task, settings, moved, tiled, parts, outcome)
+        coded = coded.with_step(change * settings.step, goal)
+        coded = replace(coded, moved=moved_transform(parts, coded.moved))
+        outcome = coded.run(task)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
     expected = Outcome(
         size=round(outcome.size * 2**-octaves),
@@ -476,6 +487,9 @@ def tiles_of(task: PlanTask, attempt: Attempt) -> Sample:
 
 def _filled_sample(task: PlanTask, blocks: Blocks, attempt: Attempt, most: int) -> Sample:
     """Return tiles of at most so many vertices together, filled as they are coded."""
+    parts = attempt.parts
+    if parts is not None and parts.complete and parts.filling and parts.blocks.tile == blocks.tile:
+        return parts
     costs = part_costs(task, blocks, attempt.settings)
     sample = Sample(blocks, most, task.workers, costs, task.parts.tick)
     return sample.filled(attempt.settings, attempt.coding.density)
