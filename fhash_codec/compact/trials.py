@@ -114,7 +114,8 @@ def plan_by_prices(task: PlanTask, settings: TileSettings) -> Attempt:
     if task.blocks.complete or not task.asks("filling"):
         return _with_step(task, found, _coded_parts(task, tiled, settings, density))
     task.parts.begin("fill values")
-    parts = _parts_of(task, tiled, settings, COMPARED_VERTICES, COMPARED_VERTICES)
+    each = COMPARED_VERTICES // (1 if prod(tiled.shape) <= COMPARED_VERTICES else 2)
+    parts = _parts_of(task, tiled, settings, each, COMPARED_VERTICES)
     if not masked:
         return _with_step(task, found, _deepened(task, tiled, parts, settings))
     there, filled = (
@@ -214,10 +215,10 @@ class CodedParts:
         return max(_at_promise(self.run(task), task.goal), 1.0)
 
     def with_step(self, step: float, goal: Goal) -> CodedParts:
-        """Return the same parts with another step."""
+        """Return the same parts with another step, and bases as precise as it needs."""
         settings = with_step(self.settings, step, goal)
         moved = replace(self.moved, step=settings.step, double=settings.double)
-        return replace(self, settings=settings, moved=moved)
+        return replace(self, settings=settings, moved=moved_transform(self.parts, moved))
 
 
 def _coded_parts(task: PlanTask, tiled: Blocks, settings: TileSettings, density: int) -> CodedParts:
@@ -386,7 +387,6 @@ def _promised_step(
             break
         # So far from where it was measured, coefficients foretell the error badly.
         coded = coded.with_step(change * settings.step, goal)
-        coded = replace(coded, moved=moved_transform(parts, coded.moved))
         outcome = coded.run(task)
     octaves = SLOPE * math.log(step / settings.step) / EXCHANGE
     expected = Outcome(
