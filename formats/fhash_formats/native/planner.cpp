@@ -21,7 +21,8 @@ constexpr double WEIGHT = 0.09;       // squared steps that a bit is worth
 constexpr double ERROR_PRICE = 0.8;   // squared error in squared steps that is worth a byte
 constexpr double BASIS_STEPS = 1.4;      // that a basis is as precise as
 constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a packed basis
-constexpr double NEAR = 1.08;         // of the cheapest on few parts: then all parts are priced
+constexpr double NEAR = 1.08;         // of the cheapest by coefficients alone: then the coder prices
+constexpr size_t MOST_NEAR = 3;       // that it prices
 constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
 constexpr double OCTAVES = 0.67;      // of bytes for an octave of squared errors: 4.5 dB an octave
 constexpr double SLOPE = 5.5;         // dB by which the PSNR falls for a step larger by e
@@ -423,25 +424,24 @@ class Planner {
                 trials.push_back(other);
         if (trials.size() == 1) return true;
         std::vector<Price> prices(trials.size());
-        const auto least = [&] {
-            double lowest = cost(prices[0]);
-            for (const Price& one : prices) lowest = std::min(lowest, cost(one));
-            return lowest;
+        const auto cheapest = [&](size_t first) {
+            size_t best = first;
+            for (size_t i = first; i < trials.size(); i++)
+                if (cost(prices[i]) < cost(prices[best])) best = i;
+            return best;
         };
         if (!price(set, set.few, tile, trials, prices.data(), true)) return false;
-        const double limit = NEAR * least();
-        std::vector<Kinds> near;
-        for (size_t i = 0; i < trials.size(); i++)
-            if (cost(prices[i]) <= limit) near.push_back(trials[i]);
-        trials = near;
-        prices.resize(trials.size());
-        if (trials.size() > 1 && !price(set, set.all, tile, trials, prices.data())) return false;
-        const double lowest = least();
-        for (size_t i = 0; i < trials.size(); i++)
-            if (cost(prices[i]) == lowest) {
-                kinds = trials[i];
-                break;
-            }
+        size_t near = 0;  // the cheapest first
+        for (double limit = 1e300; near < std::min(MOST_NEAR, trials.size()); near++) {
+            const size_t best = cheapest(near);
+            if (cost(prices[best]) > limit) break;
+            if (near == 0) limit = NEAR * cost(prices[best]);
+            std::swap(trials[near], trials[best]);
+            std::swap(prices[near], prices[best]);
+        }
+        trials.resize(near);
+        if (near > 1 && !price(set, set.all, tile, trials, prices.data())) return false;
+        kinds = trials[cheapest(0)];
         return true;
     }
 
