@@ -22,6 +22,7 @@ from fhash_codec.progress import Parts, skip
 from fhash_formats.container.reader import CACHE_BYTES
 from fhash_formats.errors import InputError
 from fhash_formats.transform.stream import MAX_TILE_VERTICES
+from fhash_formats.transform.tile import DENSITIES
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
 TILE_VERTICES = 1 << 19
@@ -391,8 +392,7 @@ class PlanTask:
     @property
     def density(self) -> int:
         """Thoroughness of filling the vertices that do not count, see `fill`."""
-        effort = self.config.effort
-        return 8 if effort >= 4 else 4 if effort > 1 else 1
+        return DENSITIES[self.config.effort > 1]
 
     @property
     def takes_fast_coder(self) -> bool:

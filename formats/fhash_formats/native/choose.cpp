@@ -263,16 +263,11 @@ namespace {
 
 constexpr double HIGHEST = 64, LOWEST = 0.4;  // first and last threshold, in quantiser steps
 constexpr double NEARBY = 16;  // first one where the present values are a good filling already
-constexpr double MOMENTUM = 0.8;  // share of the last change that is added to the next guess
+constexpr double MOMENTUM = 0.7;  // share of the last change that is added to the next guess
 constexpr int64_t FEW_BITS = 64;  // tiles of fewer are not searched with more thresholds
 
-// Ratio of a threshold to the one before it, by the number of thresholds per factor of two.
-double ratio_of(int density) {
-    return density == 2   ? 0.7071067811865476
-           : density == 4 ? 0.8408964152537145
-           : density == 8 ? 0.9170040432046712
-                          : 0.5;
-}
+// Ratio of a threshold to the one before it: eight thresholds per factor of two, or one.
+double ratio_of(int density) { return density > 1 ? 0.9170040432046712 : 0.5; }
 
 // Quantised coefficients of values.
 template <class T>

@@ -135,7 +135,7 @@ typedef struct fhash_coding {
     int32_t rounds;       /* how often values that are free to change are replaced by their decoded ones */
     int32_t passes;       /* 1, or 2: what was chosen is coded or searched once more */
     int32_t filled;       /* 1: values that do not count are a good filling already */
-    int32_t density;      /* how thoroughly a filling is searched: 0, 1, 2, 4 or 8 thresholds per factor of two */
+    int32_t density;      /* how thoroughly a filling is searched: 0, 1 or 8 thresholds per factor of two */
     int32_t keep_missing; /* 1: values that are not finite come back as they were */
     int32_t own_settings; /* 1: the stream holds the settings */
     int32_t fast;         /* 1: the fast coder, for more bytes */

@@ -38,7 +38,7 @@ TRELLIS_OFFSETS = (17, -10, -5, -3, -2, -1)
 
 It is the mean over coefficients of many series, which differ by 3 or less.
 """
-DENSITIES = (1, 2, 4, 8)
+DENSITIES = (1, 8)
 """Thresholds per factor of two with which values may be filled."""
 
 MAX_MISSING = 16
