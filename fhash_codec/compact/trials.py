@@ -352,8 +352,12 @@ def _with_coder(task: PlanTask, coded: CodedParts, size: float) -> CodedParts:
     coded: by the other coder.
     size: bytes of all tiles, approximately.
     """
+    goal, slow = task.goal, coded.run(task)
     fast = replace(coded, coding=replace(coded.coding, fast=True))
-    ratio = fast.size(task) / coded.size(task)
+    if goal.psnr is not None and goal.data_range > 0:  # at the same error
+        reached = replace(goal, psnr=slow.psnr(goal.data_range))
+        fast = fast.with_step(step_after(fast.moved, fast.run(task), reached), goal)
+    ratio = fast.size(task) / max(_at_promise(slow, goal), 1.0)
     most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
     tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
     return fast if ratio <= most else coded

@@ -1,8 +1,8 @@
 // The planner: tiles, transform and step of a series by prices of some of its parts.
 //
-// Nothing is coded. A price is the bits that the coefficients of a part are likely to take, and
-// their squared error (fhash_price). All trials are priced on a quarter of the parts, and those that
-// come near the cheapest on all of them.
+// Nothing is coded. A price is what the fast coder would take for the coefficients of a part, and
+// their squared error (fast.cpp). Transforms are sorted out by what their coefficients are likely
+// to take, whatever stands around each (fhash_price), on a quarter of the parts.
 #include <algorithm>
 #include <cmath>
 #include <map>
@@ -21,7 +21,7 @@ constexpr double WEIGHT = 0.09;       // squared steps that a bit is worth
 constexpr double ERROR_PRICE = 0.8;   // squared error in squared steps that is worth a byte
 constexpr double BASIS_STEPS = 1.4;      // that a basis is as precise as
 constexpr double BASIS_TEXT = 1.03;   // bytes in a file for each byte of a packed basis
-constexpr double NEAR = 1.08;         // of the cheapest by coefficients alone: then the coder prices
+constexpr double NEAR = 1.08;         // of the cheapest by its coefficients: the coder prices them
 constexpr size_t MOST_NEAR = 3;       // that it prices
 constexpr int64_t MAX_BASIS = 128;    // longest axis with a basis: longer ones cost too much
 constexpr double OCTAVES = 0.67;      // of bytes for an octave of squared errors: 4.5 dB an octave

@@ -458,9 +458,9 @@ SETTINGS = TileSettings(
     transform=usual_transform(TILE_SERIES_PLAN), step=0.1, center=0.5, low=0.0, high=1.0
 )
 RECIPE = Recipe(
-    tile=TILE_SERIES_PLAN, settings=SETTINGS, coding=Coding(error=0.05, rounds=2, density=4)
+    tile=TILE_SERIES_PLAN, settings=SETTINGS, coding=Coding(error=0.05, rounds=2, density=8)
 )
-FILLED = replace(RECIPE, filling=(replace(SETTINGS, step=0.2), 2))
+FILLED = replace(RECIPE, filling=(replace(SETTINGS, step=0.2), 1))
 TRAINED = replace(RECIPE, coding=replace(RECIPE.coding, aim=0.5, joint=1.2))
 
 

@@ -301,7 +301,7 @@ def test_scores_of_a_mask_are_learned_from_tiles() -> None:
 def test_more_effort_is_no_larger_and_keeps_the_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: Field
 ) -> None:
-    source = field((4, 12, 16, 16))
+    source = field((8, 16, 32, 32))
     reports = [
         fhash_codec.encode(source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0))
         for n in (1, 3, 5)

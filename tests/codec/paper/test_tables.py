@@ -357,7 +357,7 @@ def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
             np.testing.assert_array_equal(volume.occupancy(t), other.occupancy(t))
 
 
-@pytest.mark.parametrize("below", [1.0, 6.0])
+@pytest.mark.parametrize("below", [1.0, 4.0])
 def test_a_promise_is_kept_and_no_more(rough_waves, coded_config, tmp_path, below) -> None:
     source = rough_waves
     config = replace(coded_config, epochs=10)

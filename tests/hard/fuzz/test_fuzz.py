@@ -36,6 +36,7 @@ NOT_FUZZED = {
     "fhash_network_abi_version": "takes nothing",
     "fhash_function": "takes a name of the caller",
     "fhash_between": "takes frames that Python or a file has decoded; files are fuzzed",
+    "fhash_price": "takes coefficients of the planner, any floats",
     "fhash_plan": "takes the caller's own values, by arrays that Python alone makes",
     **dict.fromkeys(("fhash_network_fma", "fhash_network_copy"), "for benchmarks alone"),
     **dict.fromkeys(
