@@ -23,7 +23,7 @@ ARRAY, INTEGER, REAL = native.ARRAY, native.INTEGER, native.REAL
 _SIZED = (ARRAY, INTEGER)
 _STATE = _SIZED * 3
 """Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
-_TRANSFORM = (ARRAY,) * 9
+_TRANSFORM = (*(ARRAY,) * 9, INTEGER)
 _RECONSTRUCT = (*_TRANSFORM, ARRAY)
 _QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
 _DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)

@@ -88,6 +88,7 @@ def _inverse(bands: NDArray[np.float64], kind: str, depth: int) -> NDArray[np.fl
         (pointer * 4)(None, None, None, None),
         pointer(ones.ctypes.data),
         pointer(ones.ctypes.data),
+        1,
     )
     if code != 0:
         raise MemoryError("no memory for the norms of a transform")
@@ -102,6 +103,8 @@ def _column_norms(matrix: NDArray[np.float64]) -> Norms:
     return np.sqrt(total)
 
 
+THREADS = 2
+"""Threads that share a run; they change no bit."""
 MAX_LOD = 10
 """Most halvings of a reduced resolution."""
 
@@ -180,6 +183,7 @@ class _Plan:
             pointers,
             self.scale_tz.ctypes.data_as(ctypes.c_void_p),
             self.scale_yx.ctypes.data_as(ctypes.c_void_p),
+            THREADS,
         ]
 
 

@@ -55,7 +55,7 @@ std::int64_t fhash_decode_predicted(std::int32_t*, const std::int64_t*, const st
 // lifting.cpp, head.cpp
 #define FHASH_TRANSFORM_ARGUMENTS(T) \
     const std::int64_t*, const std::int64_t*, const std::int64_t*, const std::int64_t*, \
-        const T* const*, const T*, const T*
+        const T* const*, const T*, const T*, std::int64_t
 std::int64_t fhash_transform_forward_f32(const float*, float*, FHASH_TRANSFORM_ARGUMENTS(float));
 std::int64_t fhash_transform_inverse_f32(const float*, float*, FHASH_TRANSFORM_ARGUMENTS(float));
 std::int64_t fhash_transform_forward_f64(const double*, double*,
@@ -124,23 +124,24 @@ namespace fhash {
     inline std::int64_t transform_forward(const T* in, T* out, const std::int64_t* shape, \
                                           const std::int64_t* kinds, const std::int64_t* depths, \
                                           const std::int64_t* ranks, const T* const* matrices, \
-                                          const T* tz, const T* yx) { \
+                                          const T* tz, const T* yx, std::int64_t threads) { \
         return fhash_transform_forward_##NAME(in, out, shape, kinds, depths, ranks, matrices, tz, \
-                                              yx); \
+                                              yx, threads); \
     } \
     inline std::int64_t transform_inverse(const T* in, T* out, const std::int64_t* shape, \
                                           const std::int64_t* kinds, const std::int64_t* depths, \
                                           const std::int64_t* ranks, const T* const* matrices, \
-                                          const T* tz, const T* yx) { \
+                                          const T* tz, const T* yx, std::int64_t threads) { \
         return fhash_transform_inverse_##NAME(in, out, shape, kinds, depths, ranks, matrices, tz, \
-                                              yx); \
+                                              yx, threads); \
     } \
     inline std::int64_t reconstruct(const std::int32_t* in, T* out, const std::int64_t* shape, \
                                     const std::int64_t* kinds, const std::int64_t* depths, \
                                     const std::int64_t* ranks, const T* const* matrices, \
-                                    const T* tz, const T* yx, const double* numbers) { \
+                                    const T* tz, const T* yx, std::int64_t threads, \
+                                    const double* numbers) { \
         return fhash_reconstruct_##NAME(in, out, shape, kinds, depths, ranks, matrices, tz, yx, \
-                                        numbers); \
+                                        threads, numbers); \
     } \
     inline void dequantise(const std::int32_t* in, std::int64_t n, double step, \
                            const double* shifts, T* out) { \

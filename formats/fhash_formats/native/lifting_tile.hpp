@@ -68,13 +68,15 @@ FHASH_INLINE i64 pitch_of(i64 rows, i64 inner) {
     return padded(larger(32, smaller(smaller(BLOCK / larger(rows, 1), 1024), inner) / 32 * 32));
 }
 
-// The product of a KLT along one axis of (n, inner), in place or from `in` to `out`. filled: null,
+// The product of a KLT along one axis of (n, inner), of some columns, in place or from `in` to
+// `out`. filled: null,
 // or which rows of `in` have a number other than 0; the others are not read. `work` holds a block
 // of columns, `matrix` has room for the columns of the matrix that are left.
 template <class T>
-FHASH_INLINE void product_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse,
-                               T* work, i64* slot, const Limits<T>* limits,
-                               const unsigned char* filled, T* matrix) {
+FHASH_INLINE void product_rows(const T* in, T* out, i64 inner, i64 first, i64 last,
+                               const Axis<T>& axis, bool inverse, T* work, i64* slot,
+                               const Limits<T>* limits, const unsigned char* filled,
+                               T* matrix) {
     const i64 n = axis.n, inputs = axis.inputs(inverse), outputs = axis.outputs(inverse);
     i64 terms = 0;
     for (i64 r = 0; r < inputs; r++)
@@ -87,8 +89,8 @@ FHASH_INLINE void product_rows(const T* in, T* out, i64 inner, const Axis<T>& ax
         used = matrix;
     }
     const i64 pitch = pitch_of(terms, inner);
-    for (i64 from = 0; from < inner; from += pitch) {
-        const i64 width = smaller(pitch, inner - from);
+    for (i64 from = first; from < last; from += pitch) {
+        const i64 width = smaller(pitch, last - from);
         const std::size_t bytes = bytes_of<T>(width);
         for (i64 k = 0; k < terms; k++)
             std::memcpy(work + k * pitch, in + slot[k] * inner + from, bytes);
@@ -103,12 +105,13 @@ FHASH_INLINE void product_rows(const T* in, T* out, i64 inner, const Axis<T>& ax
 // The wavelet along one axis of (n, inner), in place or from `in` to `out`. `work` holds a block of
 // columns. limits: null, or what the results of the inverse are moved by and clipped to.
 template <class T>
-FHASH_INLINE void along_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse,
-                             T* work, i64* slot, const Limits<T>* limits) {
+FHASH_INLINE void along_rows(const T* in, T* out, i64 inner, i64 first, i64 last,
+                             const Axis<T>& axis, bool inverse, T* work, i64* slot,
+                             const Limits<T>* limits) {
     const i64 n = axis.n, pitch = pitch_of(n, inner);
     band_slots(n, axis.depth, slot);
-    for (i64 from = 0; from < inner; from += pitch) {
-        const i64 width = smaller(pitch, inner - from);
+    for (i64 from = first; from < last; from += pitch) {
+        const i64 width = smaller(pitch, last - from);
         const std::size_t bytes = bytes_of<T>(width);
         if (inverse) {
             for (i64 r = 0; r < n; r++)
@@ -315,14 +318,17 @@ FHASH_INLINE void reconstructed_rows(const std::int32_t* in, i64 rows, i64 colum
 
 // The passes over a tile, compiled once per type and machine.
 #define FHASH_PASSES(T) \
-    FHASH_CLONES void pass_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse, \
-                                T* work, i64* slot, const Limits<T>* limits) { \
-        along_rows<T>(in, out, inner, axis, inverse, work, slot, limits); \
+    FHASH_CLONES void pass_rows(const T* in, T* out, i64 inner, i64 first, i64 last, \
+                                const Axis<T>& axis, bool inverse, T* work, i64* slot, \
+                                const Limits<T>* limits) { \
+        along_rows<T>(in, out, inner, first, last, axis, inverse, work, slot, limits); \
     } \
-    FHASH_CLONES void pass_product(const T* in, T* out, i64 inner, const Axis<T>& axis, \
-                                   bool inverse, T* work, i64* slot, const Limits<T>* limits, \
-                                   const unsigned char* filled, T* matrix) { \
-        product_rows<T>(in, out, inner, axis, inverse, work, slot, limits, filled, matrix); \
+    FHASH_CLONES void pass_product(const T* in, T* out, i64 inner, i64 first, i64 last, \
+                                   const Axis<T>& axis, bool inverse, T* work, i64* slot, \
+                                   const Limits<T>* limits, const unsigned char* filled, \
+                                   T* matrix) { \
+        product_rows<T>(in, out, inner, first, last, axis, inverse, work, slot, limits, filled, \
+                        matrix); \
     } \
     FHASH_CLONES void pass_x(T* first, i64 rows, const Axis<T>& axis, bool inverse, T* work, \
                              const T* matrix) { \
@@ -369,7 +375,7 @@ public:
         : t(axes[0]), z(axes[1]), y(axes[2]), x(axes[3]), plane(y.n * x.n),
           coupled(y.kind == x.kind && y.depth == x.depth && y.kind != NONE && y.kind != KLT &&
                   y.depth > 0),
-          scale_tz(scale_tz_), scale_yx(scale_yx_) {
+          is_inverse(inverse), scale_tz(scale_tz_), scale_yx(scale_yx_) {
         i64 longest = 1, room = 0;
         for (int a = 0; a < 4; a++) {
             longest = larger(longest, axes[a].n);
@@ -381,7 +387,7 @@ public:
         const i64 work_room = larger(block_room, ROWS * x.n) + x.n + 256;
         memory = allocate<T>(work_room + matrix_room + plane + room);
         slots = allocate<i64>(longest);
-        filled = allocate<unsigned char>(y.n + z.n + t.n);
+        filled = allocate<unsigned char>(y.n + z.n);
         if (!allocated()) return;
         work = memory.get();
         matrix = work + work_room;
@@ -396,40 +402,26 @@ public:
 
     bool allocated() const { return memory && slots && filled; }
 
-    void forward(const T* in, T* out) {
-        if (!t.idle()) {
-            rows(in, out, z.n * plane, t, false);
-            in = out;
-        }
-        for (i64 i = 0; i < t.n; i++) {
-            const T* from = in + i * z.n * plane;
-            T* to = out + i * z.n * plane;
-            if (!z.idle()) {
-                rows(from, to, plane, z, false);
-                from = to;
-            }
-            for (i64 k = 0; k < z.n; k++)
-                forward_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k]);
-        }
+    // The axis of time, of some columns. The last two arguments are those of product_rows.
+    void over_time(const T* in, T* out, i64 first, i64 last, const Limits<T>* limits = nullptr,
+                   const unsigned char* some = nullptr) {
+        rows(in, out, z.n * plane, first, last, t, limits, some);
     }
 
-    void inverse(const T* in, T* out) {
-        for (i64 i = 0; i < t.n; i++) {
-            const T* from = in + i * z.n * plane;
-            T* to = out + i * z.n * plane;
-            for (i64 k = 0; k < z.n; k++)
-                inverse_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k], nullptr);
-            if (!z.idle()) rows(to, to, plane, z, true);
-        }
-        if (!t.idle()) rows(out, out, z.n * plane, t, true);
-    }
+    bool time_is_idle() const { return t.idle(); }
 
-    // The inverse from integers, moved and clipped. in: may be the memory of `out` where numbers
-    // have the size of integers.
-    void reconstruct(const std::int32_t* in, T* out, const Reconstruction<T>& values,
-                     const Limits<T>& limits) {
-        unsigned char *const planes = filled.get() + y.n, *const frames = planes + z.n;
-        for (i64 i = 0; i < t.n; i++) {
+    // The other axes of some steps; `in` may be `out` where it goes forward.
+    void frames(const T* in, T* out, i64 first, i64 last) {
+        if (is_inverse) inverse_frames(in, out, first, last);
+        else forward_frames(in, out, first, last);
+    }
+    // The inverse from integers, but for the axis of time, of some steps; where that is idle, moved
+    // and clipped. in: may be the memory of `out` where numbers have the size of integers. frames:
+    // receives which steps have an integer other than 0.
+    void reconstruct_frames(const std::int32_t* in, T* out, const Reconstruction<T>& values,
+                            const Limits<T>& limits, unsigned char* frames, i64 first, i64 last) {
+        unsigned char* const planes = filled.get() + y.n;
+        for (i64 i = first; i < last; i++) {
             T* const frame = out + i * z.n * plane;
             frames[i] = 0;
             for (i64 k = 0; k < z.n; k++) {
@@ -445,27 +437,50 @@ public:
                 }
             }
             // The last of the axes that are not idle clips.
-            const Limits<T>* const last = t.idle() ? &limits : nullptr;
+            const Limits<T>* const clips = t.idle() ? &limits : nullptr;
             if (!frames[i]) {
                 if (t.kind != KLT) std::memset(frame, 0, bytes_of<T>(z.n * plane));
-                if (last) pass_limits(frame, z.n * plane, limits);
+                if (clips) pass_limits(frame, z.n * plane, limits);
             } else if (!z.idle()) {
-                rows(frame, frame, plane, z, true, last, planes);
-            } else if (last) {
+                rows(frame, frame, plane, 0, plane, z, clips, planes);
+            } else if (clips) {
                 pass_limits(frame, z.n * plane, limits);
             }
         }
-        if (!t.idle()) rows(out, out, z.n * plane, t, true, &limits, frames);
     }
 
 private:
+    void forward_frames(const T* in, T* out, i64 first, i64 last) {
+        for (i64 i = first; i < last; i++) {
+            const T* from = in + i * z.n * plane;
+            T* to = out + i * z.n * plane;
+            if (!z.idle()) {
+                rows(from, to, plane, 0, plane, z);
+                from = to;
+            }
+            for (i64 k = 0; k < z.n; k++)
+                forward_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k]);
+        }
+    }
+
+    void inverse_frames(const T* in, T* out, i64 first, i64 last) {
+        for (i64 i = first; i < last; i++) {
+            const T* from = in + i * z.n * plane;
+            T* to = out + i * z.n * plane;
+            for (i64 k = 0; k < z.n; k++)
+                inverse_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k], nullptr);
+            if (!z.idle()) rows(to, to, plane, 0, plane, z);
+        }
+    }
+
     // One axis of (n, inner); the arguments are those of product_rows.
-    void rows(const T* from, T* to, i64 inner, const Axis<T>& axis, bool inverse,
+    void rows(const T* from, T* to, i64 inner, i64 first, i64 last, const Axis<T>& axis,
               const Limits<T>* limits = nullptr, const unsigned char* some = nullptr) {
         if (axis.kind == KLT) {
-            pass_product(from, to, inner, axis, inverse, work, slots.get(), limits, some, columns);
+            pass_product(from, to, inner, first, last, axis, is_inverse, work, slots.get(), limits,
+                         some, columns);
         } else {
-            pass_rows(from, to, inner, axis, inverse, work, slots.get(), limits);
+            pass_rows(from, to, inner, first, last, axis, is_inverse, work, slots.get(), limits);
         }
     }
 
@@ -476,7 +491,7 @@ private:
             return;
         }
         if (from != to) std::memcpy(to, from, bytes_of<T>(plane));
-        if (!y.idle()) rows(to, to, x.n, y, false);
+        if (!y.idle()) rows(to, to, x.n, 0, x.n, y);
         if (!x.idle()) pass_x(to, y.n, x, false, work, matrix);
         pass_scale(to, to, scale, scale_yx, plane);
     }
@@ -488,12 +503,12 @@ private:
         }
         pass_scale(from, to, scale, scale_yx, plane);
         if (!x.idle()) pass_x(to, y.n, x, true, work, matrix);
-        if (!y.idle()) rows(to, to, x.n, y, true);
+        if (!y.idle()) rows(to, to, x.n, 0, x.n, y);
     }
 
     const Axis<T> t, z, y, x;
     const i64 plane;
-    const bool coupled;
+    const bool coupled, is_inverse;
     const T *scale_tz, *scale_yx;
     std::unique_ptr<T[], Free> memory;
     std::unique_ptr<i64[], Free> slots;

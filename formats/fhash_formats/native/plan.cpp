@@ -177,7 +177,7 @@ std::vector<double> inverse_columns(const std::vector<double>& bands, int64_t n,
     const double* matrices[4] = {nullptr, nullptr, nullptr, nullptr};
     // Where memory runs out, the zeros make norms of 0: the caller's run has none either.
     fhash_transform_inverse_f64(bands.data(), values.data(), shape, kinds, depths, ranks, matrices,
-                                ones.data(), ones.data());
+                                ones.data(), ones.data(), 1);
     return values;
 }
 
@@ -340,6 +340,10 @@ std::shared_ptr<const Plan<T>> make_plan(fhash_context& context, const Settings&
     plan->table = band_table(settings.axes, shape);
     plan->shape = shape;
     plan->lod = lod;
+    // A stripe of fewer vertices takes hardly longer than starting a thread for it.
+    constexpr int64_t LEAST = 1 << 17;
+    plan->threads = (int)std::clamp<int64_t>(vertices(shape) / LEAST, 1,
+                                             std::max(context.threads, 1));
     const int less = std::max(lod, 0);
     double gains[4];
     for (int a = 0; a < 4; a++) {
@@ -444,7 +448,7 @@ template <class T> int64_t Plan<T>::invert(const T* coefficients, T* out) const 
     const T* of[4];
     for (int a = 0; a < 4; a++) of[a] = matrices[a].empty() ? nullptr : matrices[a].data();
     return transform_inverse(coefficients, out, bands.data(), kinds, depths, ranks, of, tz.data(),
-                             yx.data());
+                             yx.data(), threads);
 }
 
 template <class T>
@@ -452,14 +456,14 @@ int64_t Plan<T>::rebuild(const int32_t* integers, T* out, const double* numbers)
     const T* of[4];
     for (int a = 0; a < 4; a++) of[a] = matrices[a].empty() ? nullptr : matrices[a].data();
     return reconstruct(integers, out, bands.data(), kinds, depths, ranks, of, tz.data(), yx.data(),
-                       numbers);
+                       threads, numbers);
 }
 
 template <class T> int64_t Plan<T>::transform(const T* values, T* out) const {
     const T* of[4];
     for (int a = 0; a < 4; a++) of[a] = matrices[a].empty() ? nullptr : matrices[a].data();
     return transform_forward(values, out, shape.data(), kinds, depths, ranks, of, tz.data(),
-                             yx.data());
+                             yx.data(), threads);
 }
 
 template <class T>

@@ -27,6 +27,7 @@ template <class T> struct Plan {
     int64_t kinds[4], depths[4], ranks[4];
     std::vector<T> matrices[4];
     std::vector<T> tz, yx;
+    int threads = 1;  // that share a run
     int halvings[4];  // by a filter, where an axis has not so many levels
 
     // Coefficients from values, only of a plan of the forward transform.

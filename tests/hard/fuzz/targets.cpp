@@ -134,15 +134,16 @@ void transform(Reader& in, F function, R reconstruct, bool whole) {
     const std::vector<T> tz = some(shape[0] * shape[1]), yx = some(shape[2] * shape[3]),
                          values = some(volume(shape));
     std::vector<T> out(values.size());
+    const int64_t threads = 1 + static_cast<int64_t>(values.size() % 2);
     if (whole) {
         const std::vector<double> numbers = in.numbers<double>(10);
         const std::vector<std::int32_t> from = integers(in, volume(shape));
         reconstruct(from.data(), out.data(), shape.data(), kinds, depths, ranks, pointers,
-                    tz.data(), yx.data(), numbers.data());
+                    tz.data(), yx.data(), threads, numbers.data());
         return;
     }
     function(values.data(), out.data(), shape.data(), kinds, depths, ranks, pointers, tz.data(),
-             yx.data());
+             yx.data(), threads);
 }
 
 void transform(Reader& in) {
