@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 24
+ABI_VERSION = 25
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p

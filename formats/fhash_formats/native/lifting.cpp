@@ -7,6 +7,7 @@
 // time.
 #include "loops.hpp"
 
+#include <functional>
 #include <vector>
 
 #include "core.hpp"
@@ -52,8 +53,9 @@ struct Stripes {
         }
     }
 
-    // Calls `work` with a tile for each stripe of `n`, of whole blocks of `unit`.
-    template <class Work> void each(i64 n, i64 unit, const Work& work) {
+    // Calls `work` with a tile and the ends of each stripe of `n`, of whole blocks of `unit`.
+    [[gnu::noinline]] void each(i64 n, i64 unit,
+                                const std::function<void(Tile<T>&, i64, i64)>& work) {
         const i64 count = larger(smaller((i64)tiles.size(), n / unit), 1);
         const auto from = [&](i64 number) {
             return number == count ? n : n * number / count / unit * unit;
@@ -69,9 +71,9 @@ struct Stripes {
 constexpr i64 COLUMNS = 32;  // of a block: whole vectors
 
 template <class T>
-i64 transform(const T* in, T* out, const i64* shape, const i64* kinds, const i64* depths,
-              const i64* ranks, const T* const* matrices, const T* scale_tz, const T* scale_yx,
-              i64 threads, bool inverse) {
+[[gnu::noinline]] i64 transform(const T* in, T* out, const i64* shape, const i64* kinds,
+                                const i64* depths, const i64* ranks, const T* const* matrices,
+                                const T* scale_tz, const T* scale_yx, i64 threads, bool inverse) {
     return guarded([&]() -> i64 {
         Stripes<T> of(shape, kinds, depths, ranks, matrices, scale_tz, scale_yx, threads, inverse);
         if (of.error) return of.error;
