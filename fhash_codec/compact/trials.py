@@ -165,7 +165,7 @@ chose other tiles: 7 % of the bytes where it is a third."""
 DEEP = 4
 """Levels of a deep wavelet along y and x."""
 COMPARED_VERTICES = 5 << 18
-"""Vertices of the parts of tiles on which fillings are compared: half as many foretold badly."""
+"""Vertices of the parts of tiles on which fillings are compared: half as many misled."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,11 +240,13 @@ def _parts_of(
     )
 
 
-def _at_step(task: PlanTask, coded: CodedParts) -> CodedParts:
-    """Return parts at a step that is nearer to a promised PSNR."""
-    if task.goal.psnr is None or task.goal.data_range <= 0:
+def _at_step(task: PlanTask, coded: CodedParts, psnr: float | None = None) -> CodedParts:
+    """Return parts at a step that is nearer to a PSNR in dB, by default the promise, if any."""
+    goal = task.goal
+    if goal.psnr is None or goal.data_range <= 0:
         return coded
-    return coded.with_step(step_after(coded.moved, coded.run(task), task.goal), task.goal)
+    wanted = goal if psnr is None else replace(goal, psnr=psnr)
+    return coded.with_step(step_after(coded.moved, coded.run(task), wanted), goal)
 
 
 def _deepened(task: PlanTask, tiled: Blocks, parts: Sample, settings: TileSettings) -> CodedParts:
@@ -352,12 +354,9 @@ def _with_coder(task: PlanTask, coded: CodedParts, size: float) -> CodedParts:
     coded: by the other coder.
     size: bytes of all tiles, approximately.
     """
-    goal, slow = task.goal, coded.run(task)
-    fast = replace(coded, coding=replace(coded.coding, fast=True))
-    if goal.psnr is not None and goal.data_range > 0:  # at the same error
-        reached = replace(goal, psnr=slow.psnr(goal.data_range))
-        fast = fast.with_step(step_after(fast.moved, fast.run(task), reached), goal)
-    ratio = fast.size(task) / max(_at_promise(slow, goal), 1.0)
+    reached = coded.run(task).psnr(task.goal.data_range)
+    fast = _at_step(task, replace(coded, coding=replace(coded.coding, fast=True)), reached)
+    ratio = fast.size(task) / coded.size(task)
     most = most_by_fast_coder(8 * size / prod(task.blocks.shape), task.config.access)
     tell("step", f"the fast coder takes {ratio:.3f} times the bytes, {most:.3f} are allowed")
     return fast if ratio <= most else coded

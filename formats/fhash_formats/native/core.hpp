@@ -2,8 +2,8 @@
 //
 // Rules for the sources: an exported function takes plain pointers, sizes as int64_t and plain
 // numbers, and returns an int64_t: at least 0 for success, below 0 for an error. No exception
-// leaves it. No global mutable state. Floating point in a stated order only; the build
-// turns off the contraction into fused multiply-adds.
+// leaves it. No global mutable state. Floating point in a stated order only; the build turns off
+// the contraction into fused multiply-adds.
 #pragma once
 
 #include <cstdint>
