@@ -276,7 +276,7 @@ def _take_decoded(container: Container, decoded: DecodedTiles) -> None:
                 read, values, equal_nan=values.dtype.kind == "f"
             ):
                 raise RuntimeError(f"tile {index} decodes to other values than its encoder found")
-    container.take_decoded(name, decoded)
+    container.arrays[name].take_decoded(decoded)
 
 
 def missed_path(path: Path) -> Path:

@@ -522,7 +522,7 @@ class _Streams(Sequence[bytes]):
 
         def size(part: _Piece, place: tuple[int, ...]) -> int:
             with damage_named(part.path):
-                return part.table.coded_bytes(place)
+                return part.table.place(place)[1]
 
         return np.fromiter((size(*place) for place in self.tiles()), np.int64, len(self))
 

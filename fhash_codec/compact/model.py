@@ -86,7 +86,7 @@ def read_coarse(
         range(low * stride // n, (high - 1) * stride // n + 1)
         for (low, high), n in zip(region, tile[1:], strict=True)
     ]
-    array.prefetch((range(step // tile[0], step // tile[0] + 1), *grid), lod)
+    array.prefetch((range(step // tile[0], step // tile[0] + 1), *grid))
     for index in product(*grid):
         # Coarse vertices of the region that lie in the tile.
         ends = [

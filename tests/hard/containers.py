@@ -2,45 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 import zlib
 from collections.abc import Iterable
 
-from fhash_formats.container.zip_file import (
-    END,
-    Member,
-    Source,
-    comment,
-    ending,
-    local_header,
-    read_member,
-    read_members,
-)
+from fhash_formats.container.zip_file import END, Member, comment, ending, local_header
 from fhash_formats.native import crc32c
 
 Parts = list[tuple[str, bytes]]
 """Name and inflated data of each member, in the order of the file."""
 
 
-class BytesSource(Source):
-    """A file in memory, as a source of a reader."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.size = data, len(data)
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes from `offset` on."""
-        return self.data[offset : offset + size]
-
-    def close(self) -> None:
-        """Do nothing: there is no file to close."""
-
-
 def unpack(data: bytes) -> Parts:
     """Return the members of a sound container, with documents inflated."""
-    source = BytesSource(data)
-    return [
-        (name, bytes(read_member(source, member))) for name, member in read_members(source).items()
-    ]
+    with zipfile.ZipFile(io.BytesIO(data)) as file:
+        return [(name, file.read(name)) for name in file.namelist()]
 
 
 def pack(parts: Iterable[tuple[str, bytes]]) -> bytes:

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.record import MAX_LENGTH, Record
-from fhash_formats.container.zip_file import check_major
-from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats.errors import UnsupportedFileError
 from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.values import DTYPES, Double
 from fhash_formats.transform.head import MAX_HIDDEN
@@ -400,7 +399,6 @@ def validate_header(header: Mapping[str, Any]) -> None:
     that is missing or has a wrong value.
     """
     top = Record(header, "header key ")
-    check_format(top)
     dtype = _check_source(top)
     shape = top.record("domain").integers("shape", 4, 1, MAX_LENGTH)
     _check_values(top, dtype)
@@ -444,25 +442,6 @@ def _check_bulk(quality: Record) -> None:
     bulk.number_or_null("psnr")
     low, high = bulk.numbers("range", 2)
     bulk.need(low <= high, "range", "two numbers, the lower first")
-
-
-def check_format(top: Record) -> None:
-    """Check the format of a header; raises UnsupportedFileError for one of another version."""
-    if top.get("format") != FORMAT:
-        raise DamagedFileError(
-            f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed"
-        )
-    major, minor = top.integers("format_version", 2, 0, 10_000)
-    check_major(major, f"{major}.{minor}")
-    features = top.texts("required_features")
-    # Every variable has this list: a long one would be read as often.
-    top.need(len(features) == len(set(features)), "required_features", "names that stand once")
-    unknown = [name for name in features if name not in KNOWN_FEATURES]
-    if unknown:
-        raise UnsupportedFileError(
-            f"the file needs the feature {unknown[0][:80]!a}, "
-            "which this version does not know; upgrade, or encode the source again"
-        )
 
 
 def _check_source(top: Record) -> np.dtype[Any]:

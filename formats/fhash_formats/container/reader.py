@@ -2,138 +2,82 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
-from itertools import chain, pairwise
+from itertools import pairwise
 from math import prod
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Annotated, Any, BinaryIO, TypedDict
 
 import numpy as np
-import numpy.typing as npt
 
-from fhash_formats.container.array import TRANSFORM, ArrayMetadata
+from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.header import (
-    BITS_ARRAY,
-    CODED,
     COMPACT,
-    COUNTS,
-    LAYERS,
     LOWEST,
-    MASK_ARRAY,
-    MASK_FEATURES,
     MAX_LEVEL,
-    MISSING_ARRAY,
-    PAPER,
-    PLAIN_FEATURE,
-    PLAIN_TABLE_TYPES,
     POSITIONS,
-    SPARSE,
     STEP_BYTES,
     STEP_FIGURES,
     STEPS,
     TOGETHER,
-    TRANSFORM_FEATURE,
     described_coordinate,
 )
 from fhash_formats.container.hierarchy import (
+    ARRAY,
     DIMENSIONS,
-    VariablePlaces,
-    read_hierarchy,
+    PARTS,
+    SHARES,
+    read_headers,
     variable_named,
 )
+from fhash_formats.container.native_file import NativeFile
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.source_entry import AUXILIARY, check_source
-from fhash_formats.container.stored import ChunkCache, StoredArray
+from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.zip_file import (
-    DOCUMENT,
     CountedSource,
     FileSource,
-    Member,
     OpenFileSource,
     Source,
-    check_member,
     damage_named,
-    directory_entry,
-    find_signature,
-    read_members,
+    is_signed,
 )
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.series import Coordinate, meant
 from fhash_formats.support.files import is_url, local_path
 from fhash_formats.transform.head import INPUTS
 
-Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
-"""Name, shape and allowed number types of an array."""
 
+def check_beside(header: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> None:
+    """Check what libfhash does not look at when it opens a file.
 
-def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
-    """Check that the arrays are those that a valid header asks for.
-
-    Raises DamagedFileError that names the first array that is missing or does not fit.
+    These are names of coordinates, the key frames, and the figures of single steps. Raises
+    DamagedFileError where they do not fit the header.
     """
-    masked = MASK_ARRAY in arrays
-    if masked:
-        _check_mask(header, arrays)
-    for name, shape, dtypes in _required_arrays(header, arrays):
-        if name == BITS_ARRAY and masked:
-            continue
-        if name not in arrays:
-            raise DamagedFileError(f"array {name} is missing")
-        _check_array(name, arrays[name], shape, dtypes)
-        if name.startswith("tables/"):
-            _check_table_attributes(name, arrays[name], header["model"])
-    if PLAIN_FEATURE in header["required_features"]:
-        _check_layers(arrays, header["model"])
-    _check_codecs(header["required_features"], arrays)
-    for name, shape, dtypes in _optional_arrays(header):
-        if name in arrays:
-            _check_array(name, arrays[name], shape, dtypes)
-    if STEPS in arrays:
-        attributes = Record(arrays[STEPS].attributes, f"array {STEPS} attribute ")
-        attributes.integers(LOWEST, len(STEP_FIGURES), -MAX_LEVEL, MAX_LEVEL)
-        together = attributes.integer(TOGETHER, 1, MAX_LENGTH) if attributes.has(TOGETHER) else 1
-        count = -(-header["domain"]["shape"][0] // together)
-        _check_array(STEPS, arrays[STEPS], (STEP_BYTES, len(STEP_FIGURES), count), ("uint8",))
     for axis in POSITIONS:
         name = f"coords/{axis}"
         if name in arrays and "name" in arrays[name].attributes:
             Record(arrays[name].attributes, f"array {name} attribute ").text("name")
-    check_source(header, arrays)
-
-
-def _check_mask(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
-    """Check that a file may have its occupancy as a mask."""
-    reasons = (
-        (header["model"]["profile"] != PAPER, "of the profile compact, which has no such array"),
-        (SPARSE in header["model"], f"of sparse tables, which needs {BITS_ARRAY}"),
-        (
-            len(header["features"]) > MASK_FEATURES,
-            f"of {len(header['features'])} features; more than {MASK_FEATURES} need {BITS_ARRAY}",
-        ),
-        (BITS_ARRAY in arrays, f"that has {BITS_ARRAY}; only one of both may be there"),
-    )
-    for is_wrong, why in reasons:
-        if is_wrong:
-            raise DamagedFileError(f"array {MASK_ARRAY} is there in a file {why}")
-
-
-def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
-    """Raise DamagedFileError unless the key frames increase within the steps of the domain."""
-    steps = header["domain"]["shape"][0]
-    if key_frames[0] < 0 or key_frames[-1] >= steps or np.any(key_frames[1:] <= key_frames[:-1]):
-        raise DamagedFileError(f"array key_frames does not increase within 0..{steps - 1}")
-
-
-def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
-    """Bytes of the occupancy of one key frame, in ragged Morton order over the feature box.
-
-    Each axis of the box is filled up to a power of two, and each vertex has one bit.
-    """
-    return -(-prod(1 << (high - low - 1).bit_length() for low, high in box) // 8)
+    if KEY_FRAMES in arrays:
+        steps, keys = header["domain"]["shape"][0], arrays[KEY_FRAMES].read()
+        if keys[0] < 0 or keys[-1] >= steps or np.any(keys[1:] <= keys[:-1]):
+            raise DamagedFileError(f"array {KEY_FRAMES} does not increase within 0..{steps - 1}")
+    if STEPS not in arrays:
+        return
+    array = arrays[STEPS]
+    attributes = Record(array.attributes, f"array {STEPS} attribute ")
+    attributes.integers(LOWEST, len(STEP_FIGURES), -MAX_LEVEL, MAX_LEVEL)
+    together = attributes.integer(TOGETHER, 1, MAX_LENGTH) if attributes.has(TOGETHER) else 1
+    shape = (STEP_BYTES, len(STEP_FIGURES), -(-header["domain"]["shape"][0] // together))
+    if array.shape != shape or array.dtype != np.uint8:
+        raise DamagedFileError(
+            f"array {STEPS} is {array.dtype} {array.shape}; the header asks for uint8 {shape}"
+        )
 
 
 def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
@@ -152,122 +96,8 @@ def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
     return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
 
 
-def _required_arrays(
-    header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]
-) -> Iterator[Expected]:
-    """Yield the arrays that a valid header asks for; levels count from 1, as in FORMAT.md.
-
-    arrays: those of the file, whose attributes say the lengths of sparse tables.
-    """
-    model = header["model"]
-    compact = model["profile"] == COMPACT
-    described = header.get("coordinates", {})
-    for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
-        if axis not in described:
-            yield f"coords/{axis}", (length,), ("float64",)
-    key_frames = model["levels"][0][0]
-    if key_frames < header["domain"]["shape"][0]:
-        yield "key_frames", (key_frames,), ("int64",)
-    if compact and PLAIN_FEATURE not in header["required_features"]:
-        yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
-        return
-    for number, level in enumerate(model["levels"], start=1):
-        if model["tables"] == CODED:
-            for component in range(1, model["embedding_size"] + 1):
-                yield f"tables/level_{number}/component_{component}", tuple(level), ("float32",)
-            continue
-        name, size = f"tables/level_{number}", model["embedding_size"]
-        sparse = SPARSE in model
-        shape = _sparse_shape(name, level, size, arrays) if sparse else (*level, size)
-        yield name, shape, (model["tables"],)
-    shapes = layer_shapes(model)
-    if LAYERS in arrays and model["tables"] == CODED:
-        yield LAYERS, (sum(outputs * (inputs + 1) for outputs, inputs in shapes),), ("float32",)
-        shapes = []
-    for number, (outputs, inputs) in enumerate(shapes, start=1):
-        yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
-        yield f"mlp/bias_{number}", (outputs,), ("float32",)
-    # The profile compact merges its features.
-    features = 1 if compact else len(header["features"])
-    size = occupancy_bytes(header["feature_bounding_box"])
-    yield BITS_ARRAY, (features, key_frames, size), ("uint8",)
-
-
-def _sparse_shape(
-    name: str, level: Sequence[int], embedding_size: int, arrays: Mapping[str, ArrayMetadata]
-) -> tuple[int, ...]:
-    """The shape that the array of a sparse table must have, by its counts.
-
-    Args:
-        name: of the array.
-        level: vertices (t, z, y, x) of the level.
-        embedding_size: numbers at each vertex.
-        arrays: all arrays of the file.
-
-    Raises DamagedFileError where the counts do not fit the level.
-    """
-    if name not in arrays:
-        raise DamagedFileError(f"array {name} is missing")
-    attributes = Record(arrays[name].attributes, f"array {name} attribute ")
-    counts = attributes.integers(COUNTS, level[0], 0, prod(level[1:]))
-    return sum(counts), embedding_size
-
-
-def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
-    """Yield the arrays that may be left out, and are checked where they are there."""
-    model, steps = header["model"], header["domain"]["shape"][0]
-    for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
-        yield f"coords/{axis}", (length,), ("float64",)
-    yield "key_frames", (model["levels"][0][0],), ("int64",)
-    if model["profile"] == COMPACT:
-        yield "corrections", tuple(model["levels"][0]), PLAIN_TABLE_TYPES
-    else:
-        yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
-    yield MISSING_ARRAY, (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
-
-
-def _check_array(
-    name: str, array: ArrayMetadata, shape: tuple[int, ...], dtypes: tuple[str, ...]
-) -> None:
-    if array.shape != shape or array.dtype.name not in dtypes:
-        raise DamagedFileError(
-            f"array {name} is {array.dtype.name} {array.shape}; "
-            f"the header asks for {' or '.join(dtypes)} {shape}"
-        )
-
-
-def _check_table_attributes(name: str, table: ArrayMetadata, model: Mapping[str, Any]) -> None:
-    """Check the attributes without which the numbers of a table mean nothing."""
-    attributes = Record(table.attributes, f"array {name} attribute ")
-    if table.dtype == np.uint8 and model["profile"] == PAPER:
-        attributes.number("offset")
-        attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
-    if model["tables"] == CODED:
-        attributes.numbers("mixing", model["embedding_size"])
-
-
-def _check_layers(arrays: Mapping[str, ArrayMetadata], model: Mapping[str, Any]) -> None:
-    """Check the units of the weights and biases of a plain head."""
-    for number in range(1, len(layer_shapes(model)) + 1):
-        for kind in ("weight", "bias"):
-            name = f"mlp/{kind}_{number}"
-            unit = Record(arrays[name].attributes, f"array {name} attribute ")
-            unit.need(unit.number("scale") > 0, "scale", "above 0")
-
-
-def _check_codecs(required_features: Sequence[str], arrays: Mapping[str, ArrayMetadata]) -> None:
-    """Check that the header requires the feature of the codecs of the arrays."""
-    if TRANSFORM_FEATURE in required_features:
-        return
-    for name, array in arrays.items():
-        beside = name.startswith(AUXILIARY) and PLAIN_FEATURE not in required_features
-        if array.sharding is not None or (array.coding == TRANSFORM and not beside):
-            raise DamagedFileError(
-                f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
-                "which the header does not require"
-            )
-
-
+KEY_FRAMES = "key_frames"
+"""Name of the array of the key frames."""
 StorageOptions = Mapping[str, Any] | None
 """Options of a URL's file system in fsspec, by name."""
 
@@ -387,7 +217,7 @@ def is_container(path: str | Path) -> bool:
     except FhashError:
         return False
     try:
-        return find_signature(source) is not None
+        return is_signed(source)
     except (FhashError, OSError):
         return False
     finally:
@@ -431,52 +261,57 @@ class Container:
         Raises DamagedFileError, or UnsupportedFileError for a newer format.
         """
         self.path, self.size, self.location = path, source.size, None
+        self.cache_bytes = cache_bytes
         self._source = source = CountedSource(source)
-        self._cache = ChunkCache(cache_bytes)
         try:
             with damage_named(path, source):
-                members = read_members(source)
-                signature = find_signature(source)
-                assert signature is not None
-                self.digest = signature[1].rpartition(b"=")[2].decode("ascii")
-                self._documents = sum(
-                    member.name.endswith("zarr.json") for member in members.values()
-                )
-                tree = read_hierarchy(source, members)
-                for variable in tree.variables:
-                    with variable_named(variable.name, len(tree.variables)):
-                        own = {name: tree.arrays[path] for name, path in variable.places.items()}
-                        check_arrays(variable.header, own)
-            self.header_bytes = members[DOCUMENT].size
-            self.attributes = MappingProxyType(dict(tree.attributes))
-            stored = {
-                name: StoredArray(
-                    path,
-                    name,
-                    metadata,
-                    tree.chunks[name],
-                    source,
-                    self._cache,
-                    members[f"{name}/{DOCUMENT}"].size,
-                )
-                for name, metadata in tree.arrays.items()
-            }
-            if len(tree.variables) == 1:
-                only = tree.variables[0]
-                names = {place: name for name, place in only.places.items()}
-                self.header, self._name = only.header, only.name
-                self.arrays = MappingProxyType(
-                    {names.get(place, f"/{place}"): array for place, array in stored.items()}
-                )
-                _check_key_frames(self)
-            else:
-                self.header, self.arrays = tree.header, MappingProxyType(stored)
-                self.variables = MappingProxyType(
-                    {each.name: VariableContainer(self, each, members) for each in tree.variables}
-                )
+                self._file = NativeFile(source, cache_bytes)
+                self._read_nodes()
         except BaseException:
             source.close()
             raise
+
+    def _read_nodes(self) -> None:
+        """Take the header and the arrays of the file."""
+        file, self.digest = self._file, self._file.digest
+        nodes = file.nodes()
+        self._documents = len(nodes)
+        root = next(node for node in nodes if not node.path)
+        self.header_bytes = root.document_bytes
+        attributes = json.loads(root.text)["attributes"]
+        headers = read_headers(attributes.pop("fhash"))
+        self.attributes = MappingProxyType(attributes)
+        stored = {
+            node.number: StoredArray(
+                self.path, file, node, ArrayMetadata.from_dict(json.loads(node.text)), self._source
+            )
+            for node in nodes
+            if node.number
+        }
+        variables = []
+        for number, (name, header) in enumerate(headers.items()):
+            order = {each: place for place, each in enumerate(stored)}
+            places = sorted(file.places(number).items(), key=lambda place: order[place[1]])
+            arrays = {name: stored[each] for name, each in places}
+            with variable_named(name, len(headers)):
+                check_beside(header, arrays)
+                check_source(header, arrays)
+            variables.append((name, header, arrays))
+        if len(variables) == 1:
+            self._name, self.header, own = variables[0]
+            names = {array.number: name for name, array in own.items()}
+            self.arrays = MappingProxyType(
+                {names.get(n, f"/{array.name}"): array for n, array in stored.items()}
+            )
+            return
+        self.header = json.loads(root.text)["attributes"]["fhash"]
+        self.arrays = MappingProxyType({array.name: array for array in stored.values()})
+        self.variables = MappingProxyType(
+            {
+                name: VariableContainer(self, number, header, arrays)
+                for number, (name, header, arrays) in enumerate(variables)
+            }
+        )
 
     @classmethod
     def open(
@@ -568,24 +403,6 @@ class Container:
                 array.verify(count)
         return len(self.arrays)
 
-    @property
-    def cache_bytes(self) -> int:
-        """Most bytes of decoded chunks that are kept."""
-        return self._cache.limit
-
-    def take_decoded(self, name: str, chunks: Mapping[Any, npt.NDArray[Any]]) -> None:
-        """Take full chunks of an array into the cache, as whoever coded them knows they decode.
-
-        The array is checked by the checksums of its members, and no chunk is decoded. The chunks
-        become read-only. Raises DamagedFileError for a member that is not what was written.
-        """
-        with damage_named(self.path, self._source):
-            for member in self.arrays[name].chunks.values():
-                check_member(self._source, member)
-        for index, values in chunks.items():
-            values.flags.writeable = False
-            self._cache.put((self.arrays[name].name, index, 0), values)
-
     def overhead(self) -> int:
         """Bytes of the file that are no data of chunks: metadata, names, directory."""
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
@@ -593,7 +410,7 @@ class Container:
     def split(self) -> dict[str, int]:
         """Bytes of the file by what they hold, see `Split`."""
         arrays = {
-            array.name: (name, array)
+            array.number: (name, array)
             for each in self.variables.values() or [self]
             for name, array in each.arrays.items()
         }
@@ -625,8 +442,8 @@ class Container:
 
     def close(self) -> None:
         """Release the file and the cache."""
+        self._file.close()
         self._source.close()
-        self._cache.clear()
 
     def __enter__(self) -> Container:
         return self
@@ -653,28 +470,37 @@ class VariableContainer(Container):
     """
 
     def __init__(
-        self, file: Container, variable: VariablePlaces, members: Mapping[str, Member]
+        self,
+        file: Container,
+        number: int,
+        header: dict[str, Any],
+        arrays: Mapping[str, StoredArray],
     ) -> None:
-        """Take the arrays of a variable from an open file. Raises DamagedFileError."""
-        self.path, self.variable, self.header = file.path, variable.name, variable.header
+        """Take a variable of an open file.
+
+        Args:
+            file: that holds it.
+            number: of the variable, from 0.
+            header: of the variable.
+            arrays: of the variable, by name.
+        """
+        self.path, self.header = file.path, header
+        self.variable = header.get("name", header["variable"]["name"])
         self.header_bytes, self.attributes = file.header_bytes, file.attributes
-        self.arrays = MappingProxyType(
-            {name: file.arrays[place] for name, place in variable.places.items()}
-        )
-        self.digest = sha256(f"{file.digest}/{variable.name}".encode()).hexdigest()
-        self._file, self._source, self._cache = file, file._source, file._cache
+        self.cache_bytes = file.cache_bytes
+        self.arrays = MappingProxyType(dict(arrays))
+        self.digest = sha256(f"{file.digest}/{self.variable}".encode()).hexdigest()
+        self._container, self._source = file, file._source
         self._closes_file = False
-        self._own = variable.own
-        own = [f"{variable.places[name]}/" for name in variable.own]
-        documents = [f"{place}{DOCUMENT}" for place in own]
-        chunks = (member for place in own for member in file.arrays[place[:-1]].chunks.values())
-        self.size = sum(
-            member.end - member.offset + len(directory_entry(member))
-            for member in chain(chunks, (members[name] for name in documents))
-        )
-        self._documents = len(documents)
-        with variable_named(variable.name, 2):
-            _check_key_frames(self)
+        shared = [name for name in header.get(SHARES, ()) if not name.startswith(AUXILIARY)]
+        begin, table = f"{PARTS}/{number}.", header.get(ARRAY)
+        self._own = [
+            name
+            for name, array in arrays.items()
+            if name in shared or array.name.startswith(begin) or array.name == table
+        ]
+        self.size = sum(arrays[name].place_bytes for name in self._own)
+        self._documents = len(self._own)
 
     def closing_file(self) -> VariableContainer:
         """Itself, from now on with a `close` that closes the file, and so all variables."""
@@ -683,7 +509,7 @@ class VariableContainer(Container):
 
     def reopening(self) -> Location:
         """The location of the file that holds the variable, with the digest of the whole."""
-        return self._file.reopening()
+        return self._container.reopening()
 
     def overhead(self) -> int:
         """Bytes of the variable's arrays that are no data of chunks."""
@@ -696,12 +522,4 @@ class VariableContainer(Container):
     def close(self) -> None:
         """Release the file after `closing_file`, else nothing: other variables need it."""
         if self._closes_file:
-            self._file.close()
-
-
-def _check_key_frames(container: Container) -> None:
-    """Raise DamagedFileError for key frames that do not fit the header."""
-    if "key_frames" in container.arrays:
-        key_frames = container.arrays["key_frames"].read()
-        with damage_named(container.path, container._source):
-            check_key_frames(container.header, key_frames)
+            self._container.close()

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.array import (
+    MAX_DIMENSIONS,
     TRANSFORM,
     ArrayMetadata,
     Codec,
@@ -42,7 +43,7 @@ from fhash_formats.container.hierarchy import (
     shows_values,
 )
 from fhash_formats.container.reader import Container
-from fhash_formats.container.record import dumps, loads
+from fhash_formats.container.record import dumps
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.zip_file import (
     DOCUMENT,
@@ -60,7 +61,7 @@ from fhash_formats.container.zip_file import (
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.files import replacing
 from fhash_formats.support.threads import slab_shape
-from fhash_formats.support.values import plain_json
+from fhash_formats.support.values import DTYPES, plain_json
 
 Coded = npt.NDArray[Any] | bytes
 """A chunk to write: its values, or the bytes that the coder of its first codec made of them."""
@@ -449,24 +450,25 @@ class ContainerWriter:
         attributes: Mapping[str, Any] | None,
     ) -> ArrayMetadata:
         """Write the metadata of an array."""
-        try:
-            metadata = ArrayMetadata(
-                shape=tuple(int(n) for n in shape),
-                dtype=dtype,
-                chunk_shape=tuple(int(n) for n in chunk_shape),
-                codecs=tuple(codecs),
+        lengths, sides = [int(n) for n in shape], [int(n) for n in chunk_shape]
+        fits = len(lengths) == len(sides) and 1 <= len(lengths) <= MAX_DIMENSIONS
+        if not fits or min(*lengths, *sides) < 1 or dtype.name not in DTYPES:
+            raise InputError(
+                f"array {name} cannot be stored: {dtype} of shape {lengths} in chunks of {sides}"
             )
-            names, shown = self._shown(name, metadata, dimension_names, attributes or {})
-            metadata = replace(
-                metadata,
-                dimension_names=None if names is None else tuple(names),
-                attributes=dict(shown),
-            )
-            # The reader's checks are the writer's, so that a reader accepts what is written.
-            document = dumps(metadata.to_dict(), f"the metadata of array {name}")
-            ArrayMetadata.from_dict(loads(document))
-        except DamagedFileError as error:
-            raise InputError(f"array {name} cannot be stored: {error}") from error
+        metadata = ArrayMetadata(
+            shape=tuple(int(n) for n in shape),
+            dtype=dtype,
+            chunk_shape=tuple(int(n) for n in chunk_shape),
+            codecs=tuple(codecs),
+        )
+        names, shown = self._shown(name, metadata, dimension_names, attributes or {})
+        metadata = replace(
+            metadata,
+            dimension_names=None if names is None else tuple(names),
+            attributes=dict(shown),
+        )
+        document = dumps(metadata.to_dict(), f"the metadata of array {name}")
         path = self._path(name)
         self._check_name(path)
         self._arrays[path] = metadata.to_dict()

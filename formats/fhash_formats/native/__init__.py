@@ -65,10 +65,28 @@ _TILES: Prototypes = {
     "fhash_plan": (*(ARRAY,) * 4,),
     "fhash_tile_free": (ARRAY,),
     "fhash_tile_bound": (ARRAY,),
+    "fhash_file_open": (*(ARRAY,) * 4, ctypes.c_uint64, ARRAY, ARRAY),
+    "fhash_file_with": (ARRAY,) * 4,
+    "fhash_file_node": (ARRAY, INTEGER, ARRAY),
+    "fhash_file_place": (ARRAY, ctypes.c_int32, INTEGER, ARRAY, ARRAY),
+    "fhash_file_digest": (ARRAY, ARRAY),
+    "fhash_file_cache": (ARRAY, ctypes.c_uint64),
+    "fhash_array_read": (ARRAY, INTEGER, ARRAY, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
+    "fhash_array_chunk": (ARRAY, INTEGER, ARRAY, *(ctypes.c_int32,) * 2, ARRAY, ARRAY),
+    "fhash_array_stored": (ARRAY, INTEGER, *(ARRAY,) * 4),
+    "fhash_array_announce": (ARRAY, INTEGER, ARRAY, ARRAY),
+    "fhash_array_check": (ARRAY, INTEGER, ARRAY),
+    "fhash_chunk_free": (ARRAY,),
+    "fhash_close": (ARRAY,),
     "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),
 }
-"""Functions of fhash.h and part.cpp, whose result is an int32."""
-_RESULTS = {"fhash_context_create": ctypes.c_void_p, "fhash_tile_bound": ctypes.c_size_t}
+"""Functions of fhash.h, part.cpp and arrays.hpp, whose result is an int32."""
+_RESULTS = {
+    "fhash_context_create": ctypes.c_void_p,
+    "fhash_tile_bound": ctypes.c_size_t,
+    "fhash_chunk_free": None,
+    "fhash_close": None,
+}
 """Other results."""
 
 PROTOTYPES: Prototypes = {

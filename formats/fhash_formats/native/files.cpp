@@ -3,6 +3,9 @@
 #if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize("O1")
 #endif
+#if !defined(__wasm__)
+#include "files/arrays.cpp"
+#endif
 #include "files/chunks.cpp"
 #include "files/fhash.cpp"
 #include "files/file.cpp"

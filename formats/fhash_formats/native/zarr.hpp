@@ -42,8 +42,15 @@ struct Array {
     }
 };
 
+// A group or an array.
+struct Node {
+    std::string path, text;  // the text is that of its zarr.json
+    uint32_t member;         // which is the document
+};
+
 struct Hierarchy {
     std::vector<JsonDocument> documents;
+    std::vector<Node> nodes;  // in the order of the file
     std::map<std::string, Array> arrays;  // by path
     Json root = nullptr;  // attributes of the root
 
@@ -52,6 +59,7 @@ struct Hierarchy {
 
 // The type of a name; 0 for none.
 int32_t type_of_name(const char* name);
+std::string name_of_type(int32_t type);
 
 // Checks the version and the required features in the attribute `fhash` of the root
 // (variable.cpp).

@@ -10,15 +10,23 @@
 
 namespace fhash {
 
+// Is told ranges, pairs of offset and length, that will be read soon, each as it stands there.
+using Announce = void (*)(void* user, const uint64_t* ranges, uint64_t count);
+
 // A file that the caller's function reads. Its end is kept: small files are read once.
 struct Source {
     const fhash_context* context = nullptr;
     fhash_read_function function = nullptr;
+    Announce announced = nullptr;  // or null: where every read costs the same
     void* user = nullptr;
     uint64_t size = 0;
     uint64_t tail_at = 0;  // offset of `tail`
     Buffer tail;
 
+    // Tells that ranges will be read, those of more than one.
+    void announce(const std::vector<uint64_t>& ranges) const {
+        if (announced && ranges.size() > 2) announced(user, ranges.data(), ranges.size() / 2);
+    }
     bool read_tail(fhash_error& error);
     bool read(uint64_t offset, uint64_t length, uint8_t* bytes, fhash_error& error) const;
     // The same, where the bytes count against the context's memory.
@@ -40,9 +48,14 @@ struct Member {
 struct Directory {
     std::vector<Member> members;  // in the order of the file
     std::unordered_map<std::string, uint32_t> numbers;
+    char digest[65] = {};  // SHA-256 of it, hexadecimal
 
     const Member* find(const std::string& name) const;
 };
+
+constexpr int MAJOR = 2;  // version of the format that is read
+// Fails for another one.
+bool refuse_version(int major, fhash_error& error);
 
 bool read_directory(Source& source, Directory& found, fhash_error& error);
 
@@ -50,11 +63,16 @@ bool read_directory(Source& source, Directory& found, fhash_error& error);
 bool open_member(const Member& member, const uint8_t* stored, Buffer& data, fhash_error& error);
 // The same, where the data are not deflated: they begin at data_offset() - offset.
 bool check_member(const Member& member, const uint8_t* stored, fhash_error& error);
+// Checks the bytes before the data.
+bool check_header(const Member& member, const uint8_t* stored, fhash_error& error);
+// Bytes of a member's entry in the directory.
+uint64_t entry_size(const Member& member);
 
 // Whether a member is a metadata document, by its name.
 bool is_document(const std::string& name);
 
-uint32_t crc_32(const uint8_t* data, size_t size);
+// CRC-32 of bytes, behind others whose CRC-32 is `begun`.
+uint32_t crc_32(const uint8_t* data, size_t size, uint32_t begun = 0);
 
 // SHA-256 of some bytes.
 void sha256(const uint8_t* data, size_t size, uint8_t digest[32]);

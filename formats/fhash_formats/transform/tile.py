@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
-from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.errors import DamagedFileError, FhashError, InputError, UnsupportedFileError
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.support.values import Integers, Mask, Values, as_array
 from fhash_formats.transform.predict import Predictor
@@ -45,8 +45,9 @@ MAX_MISSING = 16
 """Values that an array may have for missing ones (native/chunk.cpp)."""
 
 _MEMORY = -2
-_DAMAGED = -3
-"""Status of the native library (fhash.h), as the one before."""
+"""Status of the native library (fhash.h)."""
+_ERRORS: dict[int, type[FhashError]] = {-3: DamagedFileError, -4: UnsupportedFileError}
+"""Errors by their status there; InputError for others."""
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 """Types of arrays in the order of their numbers in fhash.h, from 1."""
 
@@ -99,13 +100,13 @@ class _Tile(ctypes.Structure):
 
 
 @lru_cache
-def _context(threads: int) -> ctypes.c_void_p:
+def context(threads: int) -> ctypes.c_void_p:
     """The context of calls that use so many threads."""
     return ctypes.c_void_p(native.library().fhash_context_create(0, threads))
 
 
 if hasattr(os, "register_at_fork"):  # a thread of the parent may have held the context's lock
-    os.register_at_fork(after_in_child=_context.cache_clear)
+    os.register_at_fork(after_in_child=context.cache_clear)
 
 
 def _tile(shape: Shape, dtype: np.dtype[Any], settings: TileSettings | None) -> _Tile:
@@ -125,20 +126,23 @@ def _call(name: str, tile: _Tile, *arguments: Any) -> None:
 
 
 def call_with_context(name: str, *arguments: Any) -> None:
-    """Call a function between a context and room for an error.
+    """Call a function between a context and room for an error; raises what `call` raises."""
+    call(name, context(usable_threads()), *arguments)
 
-    Raises DamagedFileError, InputError or MemoryError.
+
+def call(name: str, *arguments: Any) -> None:
+    """Call a function with room for an error behind its arguments.
+
+    Raises DamagedFileError, UnsupportedFileError, InputError or MemoryError.
     """
     error = _Error()
-    context = _context(usable_threads())
-    function = getattr(native.library(), name)
-    status = function(context, *arguments, ctypes.byref(error))
+    status = getattr(native.library(), name)(*arguments, ctypes.byref(error))
     if not status:
         return
     text = error.text.decode("utf-8", "replace")
     if status == _MEMORY:
         raise MemoryError(text)
-    raise (DamagedFileError if status == _DAMAGED else InputError)(text)
+    raise _ERRORS.get(status, InputError)(text)
 
 
 def _stream(data: bytes | memoryview) -> tuple[ctypes.c_void_p, int]:

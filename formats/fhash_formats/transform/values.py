@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.errors import InputError
 from fhash_formats.support.values import Values
 
 _INT64 = np.iinfo(np.int64)
@@ -78,53 +77,3 @@ def pieces(size: int) -> Iterator[slice]:
 
 ZSTD_LEVEL = 9
 """Level at which arrays are written; a reader takes any."""
-ZSTD_MAX_RATIO = 32 << 10
-"""Decoded bytes per byte of zstd data.
-
-A block of at most 128 KiB takes at least a header of three bytes and one more (RFC 8878, 3.1.1.2).
-"""
-_ZSTD_MARK = 0xFD2FB528
-
-
-def zstd_content_size(data: memoryview | bytes) -> int | None:
-    """The content size in the header of a zstd frame; None where the header has none.
-
-    Raises DamagedFileError for data that do not begin with such a header (RFC 8878, 3.1.1.1).
-    """
-    if len(data) < 6 or int.from_bytes(data[:4], "little") != _ZSTD_MARK:
-        raise DamagedFileError("not a zstd frame")
-    descriptor = data[4]
-    single_segment = bool(descriptor & 0x20)
-    size_bytes = (1 if single_segment else 0, 2, 4, 8)[descriptor >> 6]
-    at = 5 + (0 if single_segment else 1) + (0, 1, 2, 4)[descriptor & 3]
-    if len(data) < at + size_bytes:
-        raise DamagedFileError("the header of the zstd frame is cut short")
-    if size_bytes == 0:
-        return None
-    return int.from_bytes(data[at : at + size_bytes], "little") + (256 if size_bytes == 2 else 0)
-
-
-def from_zstd(data: memoryview, least: int, most: int) -> npt.NDArray[np.uint8]:
-    """The bytes in one zstd frame that declares from `least` to `most` of them.
-
-    Raises DamagedFileError for data that hold none, or another number of bytes.
-    """
-    from numcodecs.zstd import decompress
-
-    declared = zstd_content_size(data)
-    if declared is None or not least <= declared <= most:
-        raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {most}")
-    if declared > ZSTD_MAX_RATIO * len(data):
-        raise DamagedFileError(
-            f"zstd declares {declared} bytes, which {len(data)} bytes cannot hold"
-        )
-    # The buffer has exactly the declared size, which bounds what a hostile frame can write.
-    found = np.empty(declared, np.uint8)
-    try:
-        decompress(data, found)
-    except (RuntimeError, ValueError) as error:
-        # zstd found no memory for its own work space: the data may be sound.
-        if "Allocation error" in str(error):
-            raise MemoryError("no memory to decompress a chunk") from error
-        raise DamagedFileError(f"zstd data are damaged: {error}") from error
-    return found

@@ -90,9 +90,9 @@ def apart(monkeypatch: pytest.MonkeyPatch) -> None:
 def damaged(whole: Path, tmp_path: Path) -> Path:
     """A copy of `whole` with one bit of its first tile flipped; the metadata are sound."""
     with fhash_codec.open(whole) as volume:
-        member = next(iter(volume.container.arrays["tables/level_1"].chunks.values()))
+        offset, _ = volume.container.arrays["tables/level_1"].place((0, 0, 0, 0))
     data = bytearray(whole.read_bytes())
-    data[member.data_offset + 8] ^= 1
+    data[offset + 8] ^= 1
     path = tmp_path / "damaged.fhz"
     path.write_bytes(data)
     return path

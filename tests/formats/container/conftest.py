@@ -6,8 +6,10 @@ tests on the path.
 
 from __future__ import annotations
 
+import math
 import struct
 import sys
+import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -17,12 +19,19 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.reader import layer_shapes, occupancy_bytes
+from fhash_formats.container.reader import layer_shapes
 from fhash_formats.container.zip_file import END, Member, comment, ending, local_header
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from sharded_files import random_values, write_sharded
+
+
+def occupancy_bytes(box: Iterable[tuple[int, int]]) -> int:
+    """Bytes of the occupancy of one key frame: a bit for each vertex of the box, whose axes are
+    filled up to powers of two."""
+    return -(-math.prod(1 << (high - low - 1).bit_length() for low, high in box) // 8)
+
 
 Parts = list[tuple[str, bytes]]
 """Name and data of each member."""
@@ -185,8 +194,26 @@ def _end(data: bytes) -> tuple[int, int, int]:
     return count, size, offset
 
 
+def members(path: Path, array: str) -> dict[tuple[int, ...], Member]:
+    """The members of the chunks of an array by index. array: its path in the hierarchy."""
+    found, begin = {}, f"{array}/c/"
+    with zipfile.ZipFile(path) as file:
+        for each in file.infolist():
+            if each.filename.startswith(begin):
+                index = tuple(map(int, each.filename.removeprefix(begin).split("/")))
+                found[index] = Member(
+                    name=each.filename,
+                    offset=each.header_offset,
+                    size=each.compress_size,
+                    crc=each.CRC,
+                )
+    return found
+
+
 class Samples:
     """Helpers that the tests of this folder share."""
+
+    members = staticmethod(members)
 
     header = staticmethod(make_header)
     compact_header = staticmethod(make_compact_header)

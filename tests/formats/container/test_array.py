@@ -23,32 +23,29 @@ from fhash_formats.container.array import (
     MAX_SHARD_CHUNKS,
     SINGLE_SHARD_CHUNKS,
     ArrayMetadata,
-    PlainCoder,
     chunk_coder,
     plain_codecs,
     sharding_codecs,
-    with_crc32c,
 )
 from fhash_formats.container.zip_file import MAX_MEMBER
-from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
+from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.native import crc32c
-from fhash_formats.transform.values import zstd_content_size
 
 DAMAGED = [
-    ("shape", [2**60], "chunks; .* are declared"),
-    ("chunk_grid.configuration.chunk_shape", [2**60], "limit"),
+    ("shape", [2**60], "chunks; another number is declared"),
+    ("chunk_grid.configuration.chunk_shape", [2**60], "more than 2.30 bytes"),
     ("chunk_grid.configuration.chunk_shape", [2**20], "zstd declares"),
     ("shape", [2**80], "shape"),
     ("shape", [-4], "shape"),
     ("shape", [True], "shape"),
     ("shape", [4.0], "shape"),
-    ("shape", [1] * 99, "axes"),
+    ("shape", [1] * 99, "shape"),
     ("shape", [4, 1], "axes"),
     ("data_type", "float32", "zstd declares|asks for float64"),
     ("codecs", {"a": 1}, "codecs"),
     ("codecs", ["bytes", 5], "codecs"),
     ("attributes", [1], "attributes"),
-    ("codecs", ..., "codecs is missing"),
+    ("codecs", ..., "codecs is not a list"),
     ("dimension_names", [1], "dimension_names"),
 ]
 UNSUPPORTED = [
@@ -107,20 +104,9 @@ def test_every_chunk_has_its_name_and_its_region() -> None:
     array, values = metadata(), np.zeros((5, 7), int)
     assert array.grid == array.inner_grid == (3, 3)
     for index in product(*map(range, array.grid)):
-        assert array.parse_key(array.chunk_key(index)) == index
+        assert array.chunk_key(index) == f"c/{index[0]}/{index[1]}"
         values[array.inner_region(index)] += 1
     assert np.all(values == 1)
-
-
-@pytest.mark.parametrize("key", ["c/3/0", "c/0", "c/0/0/0", "c/00/0", "c/-1/0", "d/0/0", "c/0/x"])
-def test_names_of_no_chunk(key) -> None:
-    with pytest.raises(DamagedFileError, match="no chunk of the array's grid"):
-        metadata().parse_key(key)
-
-
-@pytest.mark.parametrize("size", [0, 1, 255, 256, 257, 65535, 65536, 65791, 65792, 2**20])
-def test_content_size_of_what_zstd_writes(size) -> None:
-    assert zstd_content_size(memoryview(numcodecs.zstd.compress(bytes(size), 3))) == size
 
 
 @pytest.mark.parametrize("size", [0, 7, 255, 767, 768, 769, 12287, 12288, 12289, 100_003])
@@ -141,27 +127,11 @@ def test_crc32c_is_that_of_the_definition(size: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["int8", "uint16", "float16", "float64"])
-def test_decoding_gives_what_was_coded(dtype) -> None:
+def test_chunks_of_any_order_of_bytes_are_coded_alike(dtype) -> None:
     chunk = np.arange(24).reshape(2, 3, 4).astype(dtype)
     coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
-    for given in (chunk, np.asfortranarray(chunk), chunk.astype(chunk.dtype.newbyteorder())):
-        decoded = coder.decode(memoryview(coder.encode(given)))
-        np.testing.assert_array_equal(decoded, chunk)
-        assert decoded.dtype == chunk.dtype
-        assert decoded.dtype.isnative
-
-
-def test_a_lack_of_memory_is_no_damage(monkeypatch) -> None:
-    chunk = np.arange(24, dtype=np.float32)
-    coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
-    data = memoryview(coder.encode(chunk))
-
-    def fail(*_):
-        raise RuntimeError("Zstd decompression error: b'Allocation error : not enough memory'")
-
-    monkeypatch.setattr(numcodecs.zstd, "decompress", fail)
-    with pytest.raises(MemoryError):
-        coder.decode(data)
+    other = chunk.astype(chunk.dtype.newbyteorder())
+    assert coder.encode(np.asfortranarray(chunk)) == coder.encode(chunk) == coder.encode(other)
 
 
 def test_a_tile_that_would_take_gigabytes_is_refused() -> None:
@@ -177,7 +147,7 @@ CHUNKS = {
         lambda right: numcodecs.zstd.compress(bytes(1 << 26), 1),
         "zstd declares 67108864 bytes; the chunk has 32",
     ),
-    "bomb of unknown size": (lambda right: frame(bytes(1 << 16)), "zstd declares None"),
+    "bomb of unknown size": (lambda right: frame(bytes(1 << 16)), "zstd declares"),
     "bomb that lies": (lambda right: frame(bytes(1 << 16), size=32), "zstd data are damaged"),
     "two frames": (lambda right: numcodecs.zstd.compress(right, 1) * 2, "zstd data are damaged"),
     "fewer bytes": (lambda right: frame(right[:16], size=32), "zstd data are damaged"),
@@ -186,7 +156,7 @@ CHUNKS = {
     "empty": (lambda right: b"", "not a zstd frame"),
     "header only": (
         lambda right: frame(right, size=32)[:8],
-        "the header of the zstd frame is cut short",
+        "not a zstd frame",
     ),
 }
 
@@ -198,18 +168,6 @@ def test_chunk_data(sample, samples, case) -> None:
     coded += struct.pack("<I", crc32c(coded))
     data = replaced(sample, samples, "time/c/0", coded)
     refused(sample, data, f"member time/c/0: {message}")
-
-
-def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes() -> None:
-    """Otherwise damage could pass for a lack of memory, or a lack of memory for damage."""
-    float64 = np.dtype("<f8")
-    most = PlainCoder(plain_codecs(float64), float64, (2**17,))
-    data = with_crc32c(numcodecs.zstd.compress(bytes(2**20), 19))
-    assert not most.decode(memoryview(data)).any()
-    with pytest.raises(DamagedFileError, match="which 17 bytes cannot hold"):
-        PlainCoder(plain_codecs(float64), float64, (2**40,)).decode(
-            memoryview(with_crc32c(frame(b"abc"[:1], size=2**43)))
-        )
 
 
 @pytest.mark.parametrize(
@@ -234,8 +192,7 @@ def test_bytes_of_a_shard(tmp_path, samples) -> None:
     """A shard is its inner chunks without gaps, an index of (offset, bytes), and its CRC-32C."""
     values = np.arange(3, dtype=np.uint8)
     path = write_sharded(tmp_path / "a.fhz", samples, values, (2,), (6,))
-    with Container.open(path) as container:
-        member = container.arrays[NAME].chunks[0,]
+    member = samples.members(path, PATH)[0,]
     data = path.read_bytes()[member.data_offset : member.end]
     coder = coding.chunk_coder(coding.plain_codecs(values.dtype), values.dtype, (2,))
     first, second = coder.encode(values[:2]), coder.encode(np.array([2, 0], np.uint8))
@@ -245,39 +202,46 @@ def test_bytes_of_a_shard(tmp_path, samples) -> None:
 
 @pytest.mark.parametrize(
     ("chunk_shape", "shard_shape"),
-    [((2, 3), (4, 7)), ((2,), (4, 6)), ((2, 0), (4, 6)), ((1, 1), (2048, 2048))],
+    [((2, 3), (4, 7)), ((1, 1), (2048, 2048))],
 )
 def test_shards_that_do_not_fit(tmp_path, samples, chunk_shape, shard_shape) -> None:
-    with pytest.raises(InputError, match="sharding_indexed"):
-        write_sharded(
-            tmp_path / "a.fhz", samples, random_values((7, 6)), chunk_shape, shard_shape, chunks=[]
-        )
+    path = write_sharded(tmp_path / "a.fhz", samples, random_values((7, 6)), (1, 6), (7, 6))
+    parts = samples.unpack(path.read_bytes())
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
+    document = json.loads(parts[place][1])
+    document["chunk_grid"]["configuration"]["chunk_shape"] = shard_shape
+    document["codecs"][0]["configuration"]["chunk_shape"] = chunk_shape
+    parts[place] = parts[place][0], json.dumps(document).encode()
+    path.write_bytes(samples.pack(parts))
+    with pytest.raises(DamagedFileError, match="sharding_indexed"):
+        Container.open(path)
 
 
 BIG = 2**60
 
 
+ORDER = "the index of the shard has inner chunks that are missing, overlap"
 INDICES = {
-    "offset outside": (lambda t: t[1].__setitem__(0, BIG), "overlap"),
-    "size outside": (lambda t: t[1].__setitem__(1, BIG), "larger than the shard"),
+    "offset outside": (lambda t: t[1].__setitem__(0, BIG), ORDER),
+    "size outside": (lambda t: t[1].__setitem__(1, BIG), ORDER),
     "sizes that overflow": (
         lambda t: (t[0].__setitem__(1, 2**63), t[1].__setitem__(1, 2**63)),
-        "larger than the shard",
+        ORDER,
     ),
-    "overlap": (lambda t: t[1].__setitem__(0, 0), "overlap"),
-    "two at one place": (lambda t: t.__setitem__(1, list(t[0])), "overlap"),
-    "gap": (lambda t: t[1].__setitem__(1, t[1][1] - 1), "overlap"),
-    "exchanged": (lambda t: t.__setitem__(slice(0, 2), [t[1], t[0]]), "overlap"),
-    "missing": (lambda t: t.__setitem__(1, [ABSENT, ABSENT]), "missing"),
-    "half missing": (lambda t: t[1].__setitem__(0, ABSENT), "missing"),
-    "beyond the array": (lambda t: t.__setitem__(3, [0, 5]), "beyond the end"),
+    "overlap": (lambda t: t[1].__setitem__(0, 0), ORDER),
+    "two at one place": (lambda t: t.__setitem__(1, list(t[0])), ORDER),
+    "gap": (lambda t: t[1].__setitem__(1, t[1][1] - 1), ORDER),
+    "exchanged": (lambda t: t.__setitem__(slice(0, 2), [t[1], t[0]]), ORDER),
+    "missing": (lambda t: t.__setitem__(1, [ABSENT, ABSENT]), ORDER),
+    "half missing": (lambda t: t[1].__setitem__(0, ABSENT), ORDER),
+    "beyond the array": (lambda t: t.__setitem__(3, [0, 5]), ORDER),
     "empty": (
         lambda t: (
             t[2].__setitem__(1, 0),
             t[1].__setitem__(1, t[1][1] + t[2][1]),
             t[2].__setitem__(0, t[2][0] + 10**6),
         ),
-        "overlap",
+        ORDER,
     ),
 }
 
@@ -326,7 +290,7 @@ def test_hostile_indices(line, samples) -> None:
 def test_shard_shorter_than_its_index(line, samples, data) -> None:
     path, parts, at = line
     parts[at] = parts[at][0], data
-    refused_shard(path, samples, parts, f"member {PATH}/c/0: {len(data)} bytes are too few")
+    refused_shard(path, samples, parts, f"member {PATH}/c/0: too few bytes")
 
 
 def test_shards_that_declare_much(line, samples) -> None:
@@ -339,7 +303,7 @@ def test_shards_that_declare_much(line, samples) -> None:
     )
     assert MAX_SHARD_CHUNKS == 2**20
     parts[place] = parts[place][0], many.replace('"shape":[5]', f'"shape":[{2**48}]').encode()
-    refused_shard(path, samples, parts, "too few for the index|memory")
+    refused_shard(path, samples, parts, "too few bytes for the index|memory")
 
 
 SETTINGS = {
@@ -391,10 +355,9 @@ def test_sharding_stands_alone(line, samples, change) -> None:
 
 
 @pytest.mark.parametrize("part", [0, *rarely(1, 2, 3)])
-def test_every_flip_in_a_shard_is_found(sharded_file, part) -> None:
+def test_every_flip_in_a_shard_is_found(sharded_file, samples, part) -> None:
     path, _ = sharded_file
-    with Container.open(path) as container:
-        members = list(container.arrays[NAME].chunks.values())
+    members = samples.members(path, PATH).values()
     sound = path.read_bytes()
     for member in members:
         for at in range(member.offset + part, member.end, 4):

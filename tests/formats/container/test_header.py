@@ -40,11 +40,10 @@ from fhash_formats.container.hierarchy import (
     ARRAY,
     CONSOLIDATED,
     DIMENSIONS,
-    NODE,
     SHARES,
     VARIABLES,
     array_path,
-    read_variables,
+    read_headers,
 )
 from fhash_formats.container.record import MAX_DEPTH, dumps, loads
 from fhash_formats.container.zip_file import FORMAT_VERSION
@@ -213,7 +212,7 @@ def test_ulps_need_a_rule(tmp_path, samples) -> None:
         with pytest.raises(InputError, match="ulps"):
             write(tmp_path / "b.fhz", header)
     header["coordinates"]["y"] = {"values": [0, 1, 2, 3, 4], "ulps": [0] * 5}
-    with pytest.raises(InputError, match="a rule, and no values"):
+    with pytest.raises(InputError, match="whole numbers of a rule"):
         write(tmp_path / "b.fhz", header)
 
 
@@ -268,13 +267,6 @@ VERSION = {"format": "fhash", "format_version": [2, 0]}
 
 
 BAD = [
-    ("format", "FHASH"),
-    ("format_version", [1]),
-    ("format_version", [1, 0.5]),
-    ("format_version", "1.0"),
-    ("required_features", {}),
-    ("required_features", [1]),
-    ("required_features", ["transform", "transform"]),
     ("encoder", ...),
     ("encoder", []),
     ("encoder.version", 1),
@@ -462,25 +454,25 @@ def test_allowed_in_the_profile_compact(samples, path, value) -> None:
 ROOTS = {
     "newer major": (
         ("format_version", [3, 1]),
-        "the file is of format 3.1; this fhash reads format 2.x: upgrade",
+        "the file is of format 3.x; this version reads format 2.x: upgrade",
         UnsupportedFileError,
     ),
     "older major": (
         ("format_version", [1, 8]),
-        "the file is of format 1.8; this fhash reads format 2.x: encode the source again",
+        "the file is of format 1.x; this version reads format 2.x: encode the source again",
         UnsupportedFileError,
     ),
     "feature": (
         ("required_features", ["teleport"]),
-        "feature 'teleport'",
+        "feature teleport",
         UnsupportedFileError,
     ),
     "profile": (
         ("variables.0.model.profile", "magic"),
-        "profile is 'magic'",
+        "profile is magic",
         UnsupportedFileError,
     ),
-    "another format": (("format", "zhash"), "format is 'zhash'", DamagedFileError),
+    "another format": (("format", "zhash"), "format is not fhash", DamagedFileError),
 }
 
 
@@ -510,7 +502,7 @@ def test_a_file_of_format_1_is_named(sample, samples) -> None:
     def older(document) -> None:
         document["attributes"]["fhash"] = {"format": "fhash", "format_version": [1, 8]}
 
-    message = "sample.fhz: the file is of format 1.8; this fhash reads format 2.x: encode the"
+    message = "sample.fhz: the file is of format 1.x; this version reads format 2.x: encode the"
     refused(sample, edited(sample, samples, ROOT, older), message, UnsupportedFileError)
 
 
@@ -679,7 +671,6 @@ def test_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
 
 def test_paths_are_those_of_the_document(tmp_path) -> None:
     assert f"`{array_path(0, 'mlp/weight_1')}` is `mlp/weight_1`" in DOCUMENT
-    assert f"`{NODE.pattern}`" in DOCUMENT
 
 
 def test_defaults_are_those_of_the_document() -> None:
@@ -692,10 +683,10 @@ def test_no_key_of_the_example_can_be_left_out_but_defaults() -> None:
     for key in header:
         root = {**example("header"), "variables": [{k: v for k, v in header.items() if k != key}]}
         if key in (*DEFAULTS, "source"):
-            read_variables(root, [])
-        else:
+            read_headers(root)
+        elif key not in ("dimensions", "variable"):  # libfhash has looked at them before
             with pytest.raises(DamagedFileError, match=key):
-                read_variables(root, [])
+                read_headers(root)
         assert f"| `{key}` |" in DOCUMENT
 
 

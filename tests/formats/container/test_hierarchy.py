@@ -63,10 +63,10 @@ PLACES = {
         lambda p: [part for part in p if part[0] != "parts/zarr.json"],
         "lies in no group",
     ),
-    "chunk outside the grid": (lambda p: [("time/c/1", b"x"), *p], "member time/c/1"),
+    "chunk outside the grid": (lambda p: [("time/c/1", b"x"), *p], "time has 2 chunks"),
     "chunk of other rank": (
         lambda p: [("time/c/0/0", b"x"), *p],
-        "member time/c/0/0",
+        "time has 2 chunks",
     ),
     "chunk under another name": (
         lambda p: [("time/c/00", b"x"), *p],
@@ -100,21 +100,21 @@ def test_members_and_arrays(sample, samples, case) -> None:
 
 
 TEXTS = {
-    "NaN": (b'{"a": NaN}', "NaN"),
-    "Infinity": (b'{"a": -Infinity}', "Infinity"),
-    "beyond float64": (b'{"a": 1e999}', "beyond float64"),
+    "NaN": (b'{"a": NaN}', "unexpected character"),
+    "Infinity": (b'{"a": -Infinity}', "no digit after minus"),
+    "beyond float64": (b'{"a": 1e999}', "number is infinity"),
     "many digits": (b'{"a": ' + b"9" * 5000 + b"}", "JSON"),
     "twice": (b'{"a": 1, "a": 2}', "twice"),
     "deep lists": (b'{"a": ' + b"[" * 100_000 + b"]" * 100_000 + b"}", "deep"),
     "deep objects": (b'{"a":' * 50_000 + b"1" + b"}" * 50_000, "deep"),
-    "deep and cut": (b"[" * 1_000_000, "deep"),
+    "deep and cut": (b"[" * 1_000_000, "unexpected end"),
     "no JSON": (b"zarr", "JSON"),
     "cut": (b'{"a": 1', "JSON"),
     "list": (b"[1]", "object"),
     "empty": (b"", "JSON"),
     "not UTF-8": (b'{"a": "\xff"}', "JSON"),
     "half a pair": (b'{"a": "\\ud800"}', "JSON"),
-    "too long": (b" " * ((16 << 20) + 1), "limit"),
+    "too long": (b" " * ((16 << 20) + 1), "2.24 bytes|limit"),
 }
 
 
@@ -237,15 +237,15 @@ def test_an_array_at_the_root_never_stands_for_one_of_the_format(tmp_path, sampl
 
 FIRST, META = "attributes.fhash.variables.0", "consolidated_metadata.metadata"
 ROOTS = {
-    "no list": ("attributes.fhash.variables", {}, "variables is {}"),
-    "an empty list": ("attributes.fhash.variables", [], "at least one variable"),
-    "a list of numbers": ("attributes.fhash.variables", [1], "a list of objects"),
-    "a name that is no text": (f"{FIRST}.name", 5, "name is 5"),
-    "a name twice": (f"{FIRST}.name", "w", "a name that no other has"),
-    "an array in a group": (f"{FIRST}.array", "a/b", "a name of A-Z"),
-    "an array with a dot": (f"{FIRST}.array", "a.b", "a name of A-Z"),
-    "the group of parts": (f"{FIRST}.array", "parts", "a name of A-Z"),
-    "an array twice": (f"{FIRST}.array", "w", "variable 'w': .*array is 'w'"),
+    "no list": ("attributes.fhash.variables", {}, "a list of at least one object"),
+    "an empty list": ("attributes.fhash.variables", [], "a list of at least one object"),
+    "a list of numbers": ("attributes.fhash.variables", [1], "variables is not objects"),
+    "a name that is no text": (f"{FIRST}.name", 5, "name is not a text"),
+    "a name twice": (f"{FIRST}.name", "w", "names that stand once"),
+    "an array in a group": (f"{FIRST}.array", "a/b", "a name that no other has"),
+    "an array with a dot": (f"{FIRST}.array", "a.b", "a name that no other has"),
+    "the group of parts": (f"{FIRST}.array", "parts", "a name that no other has"),
+    "an array twice": (f"{FIRST}.array", "w", "variable 'w': .*array is not"),
     "an array that is not there": (f"{FIRST}.array", "q", "array tables/level_1 is missing"),
     "no array": (f"{FIRST}.array", ..., "array tables/level_1 is missing"),
     "three dimensions": (f"{FIRST}.dimensions", ["time", "z", "y"], "four different"),
@@ -258,7 +258,7 @@ ROOTS = {
     "a dimension that is a variable": (
         f"{FIRST}.dimensions",
         ["time", "z", "y", "w"],
-        "four names that no variable has",
+        "a name that a variable has",
     ),
     "a dimension that is not there": (
         f"{FIRST}.dimensions",
@@ -270,7 +270,7 @@ ROOTS = {
         ["z", "time", "y", "lon_deg_"],
         "variable 'u': array coords/time is",
     ),
-    "a feature that the root lacks": ("attributes.fhash.required_features", [], "'u': .*transform"),
+    "a feature that the root lacks": ("attributes.fhash.required_features", [], "'u': .*features"),
     "a wrong header": (f"{FIRST}.dilation", -1, "variable 'u': header key dilation"),
     "a header of another box": (
         f"{FIRST}.feature_bounding_box",
@@ -278,21 +278,25 @@ ROOTS = {
         "variable 'u': .*levels",
     ),
     "shares that are a list": (f"{FIRST}.shares", ["auxiliary/lat"], "an object"),
-    "a shared table": (f"{FIRST}.shares", {"tables/level_1": 2}, "which u is already"),
+    "a shared table": (f"{FIRST}.shares", {"tables/level_1": 2}, "is missing, or is there"),
     "shares of no variable": (f"{FIRST}.shares", {"auxiliary/a": 3}, "number of a variable"),
     "shares of no number": (f"{FIRST}.shares", {"auxiliary/a": "w"}, "number of a variable"),
     "shares that are not there": (
         f"{FIRST}.shares",
         {"auxiliary/a": 2},
-        "array parts/2.auxiliary.a is missing",
+        "auxiliary/a is missing",
     ),
-    "shares of another table": (f"{FIRST}.shares", {"auxiliary/a": [2, "tables/level_1"]}, "names"),
-    "shares of three": (f"{FIRST}.shares", {"auxiliary/a": [2, "auxiliary/a", 1]}, "names"),
-    "shares of names": (f"{FIRST}.shares", {"auxiliary/a": [["auxiliary/a"], 2]}, "names"),
+    "shares of another table": (
+        f"{FIRST}.shares",
+        {"auxiliary/a": [2, "tables/level_1"]},
+        "the number",
+    ),
+    "shares of three": (f"{FIRST}.shares", {"auxiliary/a": [2, "auxiliary/a", 1]}, "the number"),
+    "shares of names": (f"{FIRST}.shares", {"auxiliary/a": [["auxiliary/a"], 2]}, "the number"),
     "shares of another name that are not there": (
         f"{FIRST}.shares",
         {"auxiliary/a": [2, "auxiliary/b"]},
-        "array parts/2.auxiliary.b is missing",
+        "auxiliary/a is missing",
     ),
     "other documents at the root": (
         f"{META}.u.fill_value",
@@ -322,8 +326,8 @@ def test_headers_that_are_refused(tmp_path, samples, case) -> None:
         ("parts/u.a", "belongs to no variable"),
         ("parts/0", "belongs to no variable"),
         ("parts/0.", "belongs to no variable"),
-        ("parts/2.coords.x", "a coordinate, which lies at the root"),
-        ("parts/0.tables.level_1", "is already"),
+        ("parts/2.coords.x", "belongs to no variable"),
+        ("parts/0.tables.level_1", "is there twice"),
     ],
 )
 def test_arrays_that_belong_to_no_variable(tmp_path, samples, name, message) -> None:

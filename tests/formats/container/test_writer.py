@@ -9,6 +9,7 @@ import sys
 import tracemalloc
 from dataclasses import replace
 from itertools import product
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -148,20 +149,13 @@ BAD_ARRAYS = {
         r"int16 \(1,\) is needed",
     ),
     "other type": ({"chunks": [np.zeros(3, "int32"), np.zeros(1, "int32")]}, "int16 .* is needed"),
-    "bool": ({"dtype": "bool"}, "data_type"),
-    "complex": ({"dtype": "complex64"}, "data_type"),
-    "no axes": ({"shape": (), "chunk_shape": ()}, "axes"),
-    "axes differ": ({"chunk_shape": (3, 1)}, "axes"),
-    "empty axis": ({"shape": (0,)}, "shape"),
-    "empty chunk": ({"chunk_shape": (0,)}, "chunk_shape"),
-    "large chunk": ({"shape": (2**30,), "chunk_shape": (2**30,)}, "limit"),
-    "names": ({"dimension_names": ["a", "b"]}, "dimension names"),
+    "bool": ({"dtype": "bool"}, "cannot be stored"),
+    "complex": ({"dtype": "complex64"}, "cannot be stored"),
+    "no axes": ({"shape": (), "chunk_shape": ()}, "cannot be stored"),
+    "axes differ": ({"chunk_shape": (3, 1)}, "cannot be stored"),
+    "empty axis": ({"shape": (0,)}, "cannot be stored"),
+    "empty chunk": ({"chunk_shape": (0,)}, "cannot be stored"),
     "attributes": ({"attributes": {"x": np.nan}}, "JSON"),
-    "codec": ({"codecs": [{"name": "gzip"}, {"name": "crc32c"}]}, "codecs"),
-    "no checksum": (
-        {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
-        "crc32c",
-    ),
     "name": ({"name": "\u00e4"}, "not allowed"),
     "long name": ({"name": "a" * 300}, "not allowed"),
     "again": ({"name": "key_frames"}, "there already"),
@@ -185,7 +179,7 @@ def test_half_an_array_cannot_be_committed(tmp_path, samples) -> None:
         fill(writer, samples, header)
         with pytest.raises(InputError):
             writer.add_array("extra", **{**GOOD, "chunks": GOOD["chunks"][:1]})
-        with pytest.raises(InputError, match="extra has 1 chunks; 2"):
+        with pytest.raises(InputError, match="extra has 1 chunks; another number"):
             writer.commit(header)
 
 
@@ -454,8 +448,8 @@ def test_a_reader_goes_on_with_the_state_that_it_opened(tmp_path) -> None:
             np.testing.assert_array_equal(late.arrays["tables/level_1"].read()[:2], first)
 
 
-def test_an_end_that_later_ones_took_the_place_of_is_changed_rather_than_damaged(tmp_path) -> None:
-    """Positions that do not fit the header lie in the end, which every layer moves."""
+def test_an_end_that_later_ones_took_the_place_of_is_that_of_its_time(tmp_path) -> None:
+    """Positions lie in the end, which every layer moves and a reader keeps."""
     path = tmp_path / "a.fhz"
     with GrowingContainer(path) as growing:
         array = growing_array()
@@ -470,8 +464,7 @@ def test_an_end_that_later_ones_took_the_place_of_is_changed_rather_than_damaged
             growing.publish(header, mark)
             if number == 0:
                 early = Container.open(path)
-    with pytest.raises(InputError, match="the file changed since it was opened; open it again"):
-        early.coordinate("time")
+    np.testing.assert_array_equal(early.coordinate("time").values, np.arange(2.0) ** 2)
     assert early.arrays["tables/level_1"].read().shape == (2, *FRAME)
     early.close()
     with Container.open(path) as late:
@@ -629,8 +622,8 @@ def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypat
     assert paths[0].read_bytes() == paths[1].read_bytes()
     with Container.open(whole) as container, Container.open(paths[0]) as cut:
         table, other = container.arrays["tables/level_1"], cut.arrays["tables/level_1"]
-        assert len(other.chunks) > len(table.chunks)
+        assert prod(other.shard_shape) < prod(table.shard_shape)
         np.testing.assert_array_equal(table.read(), other.read())
         for index in np.ndindex(table.grid):
-            assert table.coded_bytes(index) == other.coded_bytes(index) == len(other.coded(index))
+            assert table.place(index)[1] == other.place(index)[1] == len(other.coded(index))
         assert cut.verify()

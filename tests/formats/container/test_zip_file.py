@@ -19,8 +19,11 @@ import numpy as np
 import pytest
 from forked import ended_well, forked, needs_fork
 from hostile_files import FLAGS, FULL_SIZE, METHOD, OFFSET, ROOT, SIZE, read_everything, refused
+from sharded_files import NAME, PATH, random_values, write_sharded
 
 from fhash_formats.container import Container
+from fhash_formats.container.array import ArrayMetadata, plain_codecs
+from fhash_formats.container.native_file import NativeFile
 from fhash_formats.container.zip_file import (
     FileSource,
     Member,
@@ -32,7 +35,6 @@ from fhash_formats.container.zip_file import (
     ending,
     local_header,
     merged,
-    read_members,
 )
 from fhash_formats.errors import (
     DamagedFileError,
@@ -51,13 +53,16 @@ def test_no_file_folder_and_pipe(tmp_path) -> None:
             Container.open(path)
 
 
-def test_file_cut_while_open(sample) -> None:
-    with Container.open(sample) as container:
-        sample.write_bytes(sample.read_bytes()[:100])
+def test_file_cut_while_open(tmp_path, samples) -> None:
+    path = write_sharded(
+        tmp_path / "a.fhz", samples, random_values((99, 999)), (99, 333), (99, 999)
+    )
+    with Container.open(path) as container:
+        path.write_bytes(path.read_bytes()[:100])
         with pytest.raises(InputError, match="the file changed since it was opened; open it again"):
-            container.arrays["mlp/weight_1"].read()
-    source = FileSource(sample)
-    sample.write_bytes(b"")
+            container.arrays[NAME].read()
+    source = FileSource(path)
+    path.write_bytes(b"")
     with pytest.raises(DamagedFileError, match="cut short"):
         source.read(90, 10)
     assert source.changed()
@@ -235,29 +240,53 @@ class Sparse(io.RawIOBase):
         return True
 
 
-def sparse(sizes):
+def sparse(path, samples, sizes):
+    """A container whose first array has chunks of so many bytes, which are not there."""
+    write_sharded(path, samples, random_values((2,)), (2,), (2,))
+    document = {
+        **ArrayMetadata(
+            shape=(len(sizes),),
+            dtype=np.dtype("u1"),
+            chunk_shape=(1,),
+            codecs=plain_codecs(np.dtype("u1")),
+        ).to_dict()
+    }
     members, position = [], 0
     for number, size in enumerate(sizes):
-        members.append(Member(name=f"m/{number}", offset=position, size=size, crc=number))
+        name = f"{PATH}/c/{number}"
+        members.append(Member(name=name, offset=position, size=size, crc=number))
         position = members[-1].end
-    return members, Sparse(position, ending(members))
+    begin, tail = position, []
+    for name, data in samples.unpack(path.read_bytes()):
+        if name.startswith(f"{PATH}/c/"):
+            continue
+        content = json.dumps(document).encode() if name == f"{PATH}/zarr.json" else data
+        member = Member(name=name, offset=position, size=len(content), crc=zlib.crc32(content))
+        members.append(member)
+        tail += [local_header(member), content]
+        position = member.end
+    return members, Sparse(begin, b"".join([*tail, ending(members)]))
 
 
 @pytest.mark.parametrize(
     "sizes",
     [
         pytest.param([2**31] * 4, id="beyond 4 GiB"),
-        pytest.param([2**31 - 33, 2**31 - 33 - 1, 1], id="offset of 4 GiB - 1"),
-        pytest.param([2**31 - 33, 2**31 - 33 - 2, 1], id="offset of 4 GiB - 2"),
-        pytest.param([1] * 65534, id="65534 members", marks=pytest.mark.every),
+        pytest.param([2**31 - 33, 2**31 - 96, 1], id="offset of 4 GiB - 1"),
+        pytest.param([1] * 65524, id="65534 members", marks=pytest.mark.every),
         pytest.param([1] * 65535, id="65535 members"),
-        pytest.param([1] * 70000, id="70000 members", marks=pytest.mark.every),
-        pytest.param([], id="none"),
     ],
 )
-def test_zip64_is_read_by_us_and_by_zipfile(sizes) -> None:
-    members, source = sparse(sizes)
-    assert list(read_members(source).values()) == members
+def test_zip64_is_read_by_us_and_by_zipfile(tmp_path, samples, sizes) -> None:
+    members, source = sparse(tmp_path / "a.fhz", samples, sizes)
+    source.gap = 0
+    opened = NativeFile(source, 0)
+    (node,) = [node for node in opened.nodes() if node.path == PATH]
+    assert node.stored_bytes == sum(sizes)
+    last = members[len(sizes) - 1]
+    place = (last.data_offset, last.size, last.name)
+    assert opened.stored(node.number, (len(sizes) - 1,)) == place
+    opened.close()
     with zipfile.ZipFile(source) as archive:
         entries = [
             (info.filename, info.header_offset, info.file_size) for info in archive.infolist()
@@ -266,13 +295,14 @@ def test_zip64_is_read_by_us_and_by_zipfile(sizes) -> None:
 
 
 @pytest.mark.parametrize("back", range(1, 100, 3))
-def test_zip64_records_are_in_the_digest(back) -> None:
-    _, source = sparse([2**31] * 3)
+def test_zip64_records_are_in_the_digest(tmp_path, samples, back) -> None:
+    _, source = sparse(tmp_path / "a.fhz", samples, [2**31] * 3)
+    source.gap = 0
     tail = bytearray(source.tail)
     tail[-79 - back] ^= 1
     source.tail = bytes(tail)
     with pytest.raises(DamagedFileError):
-        read_members(source)
+        NativeFile(source, 0)
 
 
 def test_zipfile_finds_a_sound_zip_of_stored_chunks(sample) -> None:
@@ -291,13 +321,13 @@ def test_zipfile_finds_a_sound_zip_of_stored_chunks(sample) -> None:
 
 
 ENTRIES = {
-    "deflated to nothing less": (METHOD, "<H", 8, "deflated and"),
-    "packed otherwise": (METHOD, "<H", 14, "ZIP method 14"),
+    "deflated to nothing less": (METHOD, "<H", 8, "may not be deflated so"),
+    "packed otherwise": (METHOD, "<H", 14, "sizes that are not allowed"),
     "encrypted": (FLAGS, "<H", 1, "encrypted"),
     "data descriptor": (FLAGS, "<H", 8, "does not allow"),
     "utf-8 names": (FLAGS, "<H", 0x800, "does not allow"),
-    "sizes differ": (SIZE, "<I", 5, "equal sizes"),
-    "huge": (FULL_SIZE, "<I", 0xFFFFFFFF, "equal sizes"),
+    "sizes differ": (SIZE, "<I", 5, "sizes that are not allowed"),
+    "huge": (FULL_SIZE, "<I", 0xFFFFFFFF, "sizes that are not allowed"),
     "another date": (14, "<H", 0x5000, "does not allow"),
     "link": (38, "<I", 0o120777 << 16, "does not allow"),
     "extra field": (30, "<H", 4, "does not allow"),
@@ -306,7 +336,7 @@ ENTRIES = {
     "offset outside": (OFFSET, "<I", 0x7FFFFFFF, "overlaps another or leaves a gap"),
     "zip64 offset without its field": (OFFSET, "<I", 0xFFFFFFFF, "does not allow|overlaps"),
     "longer name": (28, "<H", 0xFFFF, "not allowed"),
-    "no mark": (0, "<I", 0, "without its mark"),
+    "no mark": (0, "<I", 0, "a damaged entry"),
 }
 
 
@@ -378,11 +408,11 @@ def test_local_header_that_differs(sample) -> None:
 
 DEFLATED = {
     "bomb": (lambda data: deflated(bytes(15 << 20)), 15 << 20, "not valid JSON|JSON"),
-    "more than declared": (lambda data: deflated(bytes(1 << 26)), 1 << 20, "does not inflate"),
-    "less than declared": (lambda data: deflated(data), 1 << 20, "does not inflate"),
-    "beyond the limit": (lambda data: deflated(data), (16 << 20) + 1, "the limit is 16777216"),
-    "cut": (lambda data: deflated(data)[:-3], None, "does not inflate"),
-    "with a tail": (lambda data: deflated(data) + b"tail", None, "does not inflate"),
+    "more than declared": (lambda data: deflated(bytes(1 << 26)), 1 << 20, "do not inflate"),
+    "less than declared": (lambda data: deflated(data), 1 << 20, "do not inflate"),
+    "beyond the limit": (lambda data: deflated(data), (16 << 20) + 1, "may not be deflated so"),
+    "cut": (lambda data: deflated(data)[:-3], None, "do not inflate"),
+    "with a tail": (lambda data: deflated(data) + b"tail", None, "do not inflate"),
     "no deflate": (lambda data: b"\xff" * 40, None, "deflated data are damaged"),
 }
 
@@ -410,7 +440,7 @@ def test_chunks_are_never_deflated(sample, samples) -> None:
     parts = samples.unpack(sample.read_bytes())
     name, data = next(part for part in parts if not part[0].endswith(ROOT))
     packed = samples.pack(parts, {name: (deflated(data), len(data), zlib.crc32(data))})
-    refused(sample, packed, "only metadata may be")
+    refused(sample, packed, "may not be deflated so")
 
 
 @pytest.mark.parametrize(
@@ -418,8 +448,8 @@ def test_chunks_are_never_deflated(sample, samples) -> None:
     [
         (8, "<H", 3, "contradicts"),
         (10, "<H", 3, "contradicts|entries"),
-        (12, "<I", 2**31, "limit"),
-        (16, "<I", 1, "it ends at"),
+        (12, "<I", 2**31, "does not end where"),
+        (16, "<I", 1, "does not end where"),
         (10, "<H", 65535, "ZIP64"),
     ],
 )
@@ -440,6 +470,6 @@ def test_another_format(sample, major, advice) -> None:
     refused(
         sample,
         data.replace(b"fhash 2 sha256", b"fhash %s sha256" % major),
-        rf"of format {major.decode()}\.x; this fhash reads format 2\.x: {advice}",
+        rf"of format {major.decode()}\.x; this version reads format 2\.x: {advice}",
         UnsupportedFileError,
     )

@@ -25,7 +25,8 @@ constexpr uint64_t ABSENT = ~uint64_t(0);
 constexpr uint64_t INDEX_ENTRY = 16;       // bytes of an inner chunk in the index of its shard
 constexpr uint64_t CHUNK_GAP = 16 << 10;   // bytes between two chunks that are read as well
 constexpr uint64_t CHUNK_READ = 8 << 20;   // bytes of a read of several chunks
-constexpr uint64_t SMALL_INDEX = 64 << 10; // bytes up to which all of an index is read
+constexpr uint64_t FAR_READ = 2 << 20;     // the same where reads are announced, and made at once
+constexpr uint64_t SMALL_INDEX = 16 << 10; // bytes up to which all of an index is read
 constexpr uint64_t SHARE = 4;              // as is one of which that share is needed
 constexpr uint64_t INDEX = 1000;           // in the place of a level of detail, in the cache
 constexpr uint64_t UNCORRECTED = 1001;     // likewise: tiles before their head
@@ -33,11 +34,10 @@ constexpr uint64_t UNCORRECTED = 1001;     // likewise: tiles before their head
 // An inner chunk that is to be read.
 struct Wanted {
     Lengths place;
-    uint64_t number;          // in the grid of inner chunks
-    const Member* member;
-    uint64_t in_shard;        // number in the shard
-    uint64_t offset, length;  // in the file
-    uint64_t skip;            // bytes before the data
+    uint64_t number;    // in the grid of inner chunks
+    bool ahead;         // whether nobody asked for it yet
+    Stored stored;
+    uint64_t in_shard;  // number in the shard
 };
 
 bool check_crc(const uint8_t* data, size_t size, fhash_error& error) {
@@ -171,6 +171,25 @@ struct Indices {
         return product;
     }
 
+    uint64_t index_bytes() const { return chunks() * INDEX_ENTRY + 4; }
+    const Member& member_of(uint64_t shard) const {
+        return file.directory.members[array.members[size_t(shard)]];
+    }
+
+    // What is read of the index of a shard for the entries from `first` to `last`.
+    struct Span {
+        uint64_t offset, length;
+        bool whole;
+    };
+    Span span_of(uint64_t shard, uint64_t first, uint64_t last) const {
+        const bool whole =
+            index_bytes() <= SMALL_INDEX || (last - first + 1) * SHARE >= chunks();
+        const uint64_t start = member_of(shard).data_offset() + member_of(shard).size -
+                               index_bytes();
+        if (whole) return {start, index_bytes(), true};
+        return {start + first * INDEX_ENTRY, (last - first + 1) * INDEX_ENTRY, false};
+    }
+
     // Which inner chunks of a shard hold a vertex of the array.
     bool present(uint64_t shard, uint64_t number) const {
         for (int a = array.axes - 1; a >= 0; a--) {
@@ -212,26 +231,21 @@ struct Indices {
         if (found && uint64_t(found->shape[0]) <= first &&
             last < uint64_t(found->shape[0]) + found->values.size() / INDEX_ENTRY)
             return found;
-        const Member& member = file.directory.members[array.members[size_t(shard)]];
-        const uint64_t count = chunks(), index_bytes = count * INDEX_ENTRY + 4;
-        if (member.size < index_bytes) {
+        const Member& member = member_of(shard);
+        const Span span = span_of(shard, first, last);
+        if (member.size < index_bytes()) {
             fail(error, FHASH_ERROR_DAMAGED, "member %s: too few bytes for the index of a shard",
                  member.name.c_str());
             return nullptr;
         }
-        const uint64_t data_bytes = member.size - index_bytes;
-        const bool whole = index_bytes <= SMALL_INDEX || (last - first + 1) * SHARE >= count;
         const std::shared_ptr<Chunk> made = std::make_shared<Chunk>();
-        made->shape[0] = whole ? 0 : int64_t(first);
-        const uint64_t start =
-            member.data_offset() + data_bytes + uint64_t(made->shape[0]) * INDEX_ENTRY;
-        const uint64_t length = whole ? index_bytes : (last - first + 1) * INDEX_ENTRY;
+        made->shape[0] = span.whole ? 0 : int64_t(first);
         Buffer& bytes = made->values;
-        if (!file.source.read(start, length, bytes, error)) return nullptr;
-        if (whole) {
+        if (!file.source.read(span.offset, span.length, bytes, error)) return nullptr;
+        if (span.whole) {
             const bool good = check_crc(bytes.data(), bytes.size(), error);
             bytes.resize(bytes.size() - 4);
-            if (!good || !check(shard, bytes, data_bytes, error)) {
+            if (!good || !check(shard, bytes, member.size - index_bytes(), error)) {
                 fail_in(error, "member " + member.name);
                 return nullptr;
             }
@@ -240,18 +254,26 @@ struct Indices {
         return made;
     }
 
-    bool locate(const Chunk& entries, Wanted& wanted, fhash_error& error) const {
+    bool locate(const Chunk& entries, const Member& member, Wanted& wanted,
+                fhash_error& error) const {
         const uint64_t at = wanted.in_shard - uint64_t(entries.shape[0]);
         const uint64_t offset = from_little(entries.values.data() + INDEX_ENTRY * at, 8);
         const uint64_t length = from_little(entries.values.data() + INDEX_ENTRY * at + 8, 8);
-        const uint64_t data_bytes = wanted.member->size - (chunks() * INDEX_ENTRY + 4);
+        const uint64_t data_bytes = member.size - index_bytes();
         if (length > data_bytes || offset > data_bytes - length)
             return fail(error, FHASH_ERROR_DAMAGED,
                         "member %s: an inner chunk is missing or reaches beyond the shard",
-                        wanted.member->name.c_str());
-        wanted.offset = wanted.member->data_offset() + offset;
-        wanted.length = length;
+                        member.name.c_str());
+        wanted.stored.offset = member.data_offset() + offset;
+        wanted.stored.length = length;
         return true;
+    }
+
+    // The first and the last number of some inner chunks in their shard.
+    static std::pair<uint64_t, uint64_t> ends(const std::vector<Wanted*>& of) {
+        const auto order = [](const Wanted* a, const Wanted* b) { return a->in_shard < b->in_shard; };
+        const auto found = std::minmax_element(of.begin(), of.end(), order);
+        return {(*found.first)->in_shard, (*found.second)->in_shard};
     }
 
     bool locate_all(std::vector<Wanted>& wanted, fhash_error& error) {
@@ -264,27 +286,32 @@ struct Indices {
                         uint64_t(each.place[a] / along);
                 number = number * uint64_t(along) + uint64_t(each.place[a] % along);
             }
-            each.member = &file.directory.members[array.members[size_t(shard)]];
+            each.stored.member = array.members[size_t(shard)];
             each.in_shard = number;
             if (array.sharded) {
                 shards[shard].push_back(&each);
                 continue;
             }
-            each.offset = each.member->offset;
-            each.length = each.member->end() - each.offset;
-            each.skip = each.member->data_offset() - each.offset;
+            const Member& member = member_of(shard);
+            each.stored.offset = member.offset;
+            each.stored.length = member.end() - member.offset;
+            each.stored.skip = member.data_offset() - member.offset;
         }
+        std::vector<uint64_t> ranges;
         for (const auto& shard : shards) {
-            const auto order = [](const Wanted* a, const Wanted* b) {
-                return a->in_shard < b->in_shard;
-            };
-            const auto ends =
-                std::minmax_element(shard.second.begin(), shard.second.end(), order);
-            const ChunkPointer found = entries(shard.first, (*ends.first)->in_shard,
-                                               (*ends.second)->in_shard, error);
+            if (!file.source.announced || member_of(shard.first).size < index_bytes()) continue;
+            if (file.cache.get({array.number, shard.first, INDEX})) continue;
+            const auto [first, last] = ends(shard.second);
+            const Span span = span_of(shard.first, first, last);
+            ranges.insert(ranges.end(), {span.offset, span.length});
+        }
+        file.source.announce(ranges);
+        for (const auto& shard : shards) {
+            const auto [first, last] = ends(shard.second);
+            const ChunkPointer found = entries(shard.first, first, last, error);
             if (!found) return false;
             for (Wanted* each : shard.second)
-                if (!locate(*found, *each, error)) return false;
+                if (!locate(*found, member_of(shard.first), *each, error)) return false;
         }
         return true;
     }
@@ -295,12 +322,21 @@ struct Decoded {
     std::shared_ptr<Chunk> chunk, table;
 };
 
+// Bytes that are read at once: of some inner chunks, one after the other.
+struct Span {
+    uint64_t start, stop;
+    size_t count;  // inner chunks in it
+    bool needed;   // whether somebody asked for one of them
+    bool lost;     // whether they cannot be read, and are not needed
+    Buffer bytes;
+};
+
 // Reads and decodes chunks, those that lie together with one read, several at once in threads.
 struct Reading {
     fhash_file& file;
     const Array& array;
     const Region& region;
-    int lod;
+    const Manner& manner;
     const Visit& visit;
 
     // A tile before its head, and the part of it that the region asks for; `done` says whether
@@ -327,82 +363,143 @@ struct Reading {
     }
 
     bool decode(const Wanted& wanted, const uint8_t* data, Decoded& decoded, fhash_error& error) {
-        const Member& member = *wanted.member;
+        const Member& member = file.directory.members[wanted.stored.member];
         if (!array.sharded && !check_member(member, data, error)) return false;
-        const uint8_t* const stream = data + wanted.skip;
-        const size_t size = size_t(wanted.length - wanted.skip);
+        const uint8_t* const stream = data + wanted.stored.skip;
+        const size_t size = size_t(wanted.stored.length - wanted.stored.skip);
         bool done = false, good = true;
         decoded.chunk = std::make_shared<Chunk>();
-        if (!lod && is_parted(array)) {
+        if (!manner.lod && manner.keep && is_parted(array)) {
             decoded.table = std::make_shared<Chunk>();
             good = decode_part(wanted, stream, size, *decoded.table, *decoded.chunk, done, error);
         }
         if (!done) decoded.table = nullptr;
         if (good && !done)
-            good = decode_chunk(*file.context, array, stream, size, lod, *decoded.chunk, error);
+            good = decode_chunk(*file.context, array, stream, size, manner.lod, *decoded.chunk,
+                                error);
         if (good) return true;
         std::string name = "member " + member.name;
         if (array.sharded) name += ": inner chunk " + std::to_string(wanted.in_shard);
         return fail_in(error, name);
     }
 
-    // Decodes chunks whose bytes lie in `bytes`, which begin at `start`.
-    bool decode_all(const Wanted* wanted, size_t count, const Buffer& bytes, uint64_t start,
-                    fhash_error& error) {
+    // Keeps what was decoded, and lets the caller see it.
+    bool take(const Wanted& wanted, const Decoded& decoded) {
+        const bool apart = decoded.table != nullptr;
+        if (manner.keep)
+            file.cache.put({array.number, wanted.number, apart ? UNCORRECTED : uint64_t(manner.lod)},
+                           apart ? decoded.table : decoded.chunk);
+        return wanted.ahead || visit(wanted.place, *decoded.chunk);
+    }
+
+    size_t usual_threads() const {
         const uint64_t each = array.inner_values() * (fhash_type_size(array.type) + 1);
-        size_t threads = std::min(size_t(file.context->threads), count);
-        if (file.context->memory)  // no more at once than the memory allows
-            threads = std::min<uint64_t>(threads, std::max<uint64_t>(
-                                                      1, file.context->memory / 32 / each));
-        for (size_t first = 0; first < count; first += threads) {
-            const size_t now = std::min(threads, count - first);
+        const uint64_t threads = uint64_t(file.context->threads);
+        if (!file.context->memory) return size_t(threads);
+        // No more at once than the memory allows.
+        return size_t(std::min(threads, std::max<uint64_t>(1, file.context->memory / 32 / each)));
+    }
+
+    // Decodes chunks whose bytes were read, as many at once as there are threads.
+    bool decode_all(const Wanted* wanted, const std::vector<Span>& spans, fhash_error& error) {
+        std::vector<const uint8_t*> places;
+        std::vector<uint8_t> lost;
+        for (const Span& span : spans) lost.insert(lost.end(), span.count, span.lost);
+        for (const Span& span : spans)
+            for (size_t i = 0; i < span.count; i++)
+                places.push_back(span.bytes.data() +
+                                 (wanted[places.size()].stored.offset - span.start));
+        const size_t threads = usual_threads();
+        for (size_t first = 0; first < places.size(); first += threads) {
+            const size_t now = std::min(threads, places.size() - first);
             std::vector<Decoded> chunks(now);
             std::vector<fhash_error> errors(now);
             std::vector<uint8_t> done(now, 0);
             const auto work = [&](int i) {
-                const Wanted& one = wanted[first + size_t(i)];
-                done[size_t(i)] = decode(one, bytes.data() + (one.offset - start),
-                                         chunks[size_t(i)], errors[size_t(i)]);
+                const size_t at = first + size_t(i);
+                done[size_t(i)] = !lost[at] && decode(wanted[at], places[at], chunks[size_t(i)],
+                                                      errors[size_t(i)]);
             };
             if (now == 1) work(0);
             else together(int(now), work);
             for (size_t i = 0; i < now; i++) {
-                if (!done[i]) {
-                    error = errors[i];
-                    return false;
-                }
-                const Wanted& one = wanted[first + i];
-                const bool apart = chunks[i].table != nullptr;
-                file.cache.put({array.number, one.number, apart ? UNCORRECTED : uint64_t(lod)},
-                               apart ? chunks[i].table : chunks[i].chunk);
-                if (!visit(one.place, *chunks[i].chunk)) return false;
+                if (!done[i] && wanted[first + i].ahead) continue;  // it fails again once wanted
+                if (!done[i]) error = errors[i];
+                if (!done[i] || !take(wanted[first + i], chunks[i])) return false;
             }
         }
         return true;
     }
 
-    bool read(std::vector<Wanted>& wanted, fhash_error& error) {
-        std::sort(wanted.begin(), wanted.end(),
-                  [](const Wanted& a, const Wanted& b) { return a.offset < b.offset; });
+    // The reads of some chunks, which are in the order of the file.
+    std::vector<Span> spans_of(const std::vector<Wanted>& wanted) const {
         const uint64_t memory = file.context->memory;
-        const uint64_t most = memory ? std::min(CHUNK_READ, memory / 8) : CHUNK_READ;
-        for (size_t first = 0, last; first < wanted.size(); first = last) {
-            const uint64_t start = wanted[first].offset;
-            uint64_t stop = start + wanted[first].length;
-            for (last = first + 1; last < wanted.size(); last++) {
-                const uint64_t end = wanted[last].offset + wanted[last].length;
-                if (wanted[last].offset > stop + CHUNK_GAP) break;
-                if (std::max(stop, end) - start > most) break;
-                stop = std::max(stop, end);
+        const uint64_t usual = file.source.announced ? FAR_READ : CHUNK_READ;
+        const uint64_t most = memory ? std::min(usual, memory / 8) : usual;
+        std::vector<Span> spans;
+        for (const Wanted& each : wanted) {
+            const uint64_t start = each.stored.offset, end = start + each.stored.length;
+            const bool near = !spans.empty() && start <= spans.back().stop + CHUNK_GAP &&
+                              std::max(end, spans.back().stop) - spans.back().start <= most;
+            if (!near) spans.push_back({start, end, 0, false, false, {}});
+            spans.back().stop = std::max(spans.back().stop, end);
+            spans.back().count++;
+            spans.back().needed = spans.back().needed || !each.ahead;
+        }
+        return spans;
+    }
+
+    bool read(std::vector<Wanted>& wanted, fhash_error& error) {
+        std::sort(wanted.begin(), wanted.end(), [](const Wanted& a, const Wanted& b) {
+            return a.stored.offset < b.stored.offset;
+        });
+        std::vector<Span> spans = spans_of(wanted);
+        std::vector<uint64_t> ranges;
+        for (const Span& span : spans)
+            ranges.insert(ranges.end(), {span.start, span.stop - span.start});
+        file.source.announce(ranges);
+        size_t begun = 0;
+        for (size_t next = 0; next < spans.size();) {
+            // Several reads together, where one has too few chunks for the threads.
+            std::vector<Span> some;
+            size_t count = 0;
+            while (next < spans.size() && (some.empty() || count < usual_threads())) {
+                Span& span = spans[next++];
+                if (!file.source.read(span.start, span.stop - span.start, span.bytes, error)) {
+                    if (span.needed) return false;
+                    span.lost = true;
+                }
+                count += span.count;
+                some.push_back(std::move(span));
             }
-            Buffer bytes;
-            if (!file.source.read(start, stop - start, bytes, error) ||
-                !decode_all(wanted.data() + first, last - first, bytes, start, error))
-                return false;
+            if (!decode_all(wanted.data() + begun, some, error)) return false;
+            begun += count;
         }
         return true;
     }
 };
+
+// How many layers of chunks after those of a read are worth decoding with them: the number of times
+// that reads in a row went on along the first axis, without a gap and with the same chunks of the
+// other axes; 0 for a read that does not go on.
+int64_t layers_after(fhash_file& file, const Array& array, const Lengths& first,
+                     const Lengths& last) {
+    Opened& opened = *file.opened;
+    Guard guard(opened.lock);
+    const bool known = opened.courses.count(array.number) != 0;
+    Course& course = opened.courses[array.number];
+    const Lengths begun = course.first, ended = course.last;
+    course.first = first;
+    course.last = last;
+    const auto same = [&](int from) {
+        return std::equal(first.begin() + from, first.begin() + array.axes, begun.begin() + from) &&
+               std::equal(last.begin() + from, last.begin() + array.axes, ended.begin() + from);
+    };
+    if (!known || !same(1)) course.moves = 0;
+    else if (first[0] <= ended[0] && ended[0] < last[0]) return ++course.moves;
+    else if (!same(0)) course.moves = 0;
+    return 0;
+}
 
 }  // namespace
 
@@ -447,52 +544,118 @@ static bool find_whole(fhash_file& file, const Array& array, const Cache::Key& k
     return true;
 }
 
-bool visit_chunks(fhash_file& file, const Array& array, const Region& region, int lod,
-                  const Visit& visit, fhash_error& error) {
-    Lengths first = {}, last = {}, place = {};
+// The chunks of a region.
+struct Grid {
+    const Array& array;
+    const Region& region;
+    Lengths first = {}, last = {};  // along each axis
     uint64_t count = 1;
-    // Whether the region has a position in the chunk along an axis.
-    const auto touched = [&](int a) {
-        const int64_t start = std::max(place[a] * array.inner[a], region.first[a]);
-        const int64_t stop = std::min((place[a] + 1) * array.inner[a], region.last[a]);
-        const int64_t step = region.step[a];
-        return region.first[a] + (start - region.first[a] + step - 1) / step * step < stop;
-    };
-    for (int a = 0; a < array.axes; a++) {
-        first[a] = place[a] = region.first[a] / array.inner[a];
-        last[a] = (region.last[a] - 1) / array.inner[a] + 1;
-        count *= uint64_t(last[a] - first[a]);
-    }
-    if (!may_use(*file.context, count * sizeof(Wanted), error)) return false;
-    std::vector<Wanted> wanted;
-    for (uint64_t i = 0; i < count; i++) {
-        uint64_t number = 0;
-        bool needed = true;
+
+    Grid(const Array& of, const Region& within) : array(of), region(within) {
         for (int a = 0; a < array.axes; a++) {
-            number = number * uint64_t(array.count(array.inner, a)) + uint64_t(place[a]);
-            needed = needed && touched(a);
+            first[a] = region.first[a] / array.inner[a];
+            last[a] = (region.last[a] - 1) / array.inner[a] + 1;
+            count *= uint64_t(last[a] - first[a]);
         }
-        const Cache::Key key = {array.number, number, uint64_t(lod)};
-        ChunkPointer kept = needed ? file.cache.get(key) : nullptr;
-        const bool apart = needed && !kept && !lod && is_parted(array);
-        if (apart && !find_whole(file, array, key, kept, error)) return false;
-        if (needed && !kept) wanted.push_back({place, number, nullptr, 0, 0, 0, 0});
-        if (kept && !visit(place, *kept)) return false;
-        for (int a = array.axes - 1; a >= 0 && ++place[a] == last[a]; a--) place[a] = first[a];
     }
-    if (wanted.empty()) return true;
-    Indices indices{file, array};
-    Reading reading{file, array, region, lod, visit};
-    return indices.locate_all(wanted, error) && reading.read(wanted, error);
+    // Whether the region has a position in a chunk.
+    bool touches(const Lengths& place) const {
+        for (int a = 0; a < array.axes; a++) {
+            const int64_t start = std::max(place[a] * array.inner[a], region.first[a]);
+            const int64_t stop = std::min((place[a] + 1) * array.inner[a], region.last[a]);
+            const int64_t step = region.step[a];
+            if (region.first[a] + (start - region.first[a] + step - 1) / step * step >= stop)
+                return false;
+        }
+        return true;
+    }
+    uint64_t number(const Lengths& place) const {
+        uint64_t found = 0;
+        for (int a = 0; a < array.axes; a++)
+            found = found * uint64_t(array.count(array.inner, a)) + uint64_t(place[a]);
+        return found;
+    }
+    // Calls `work` for each place between two ends, until it fails.
+    template <class Work> bool each(const Lengths& from, const Lengths& to, Work work) const {
+        Lengths place = from;
+        while (place[0] < to[0]) {
+            if (!work(place)) return false;
+            int a = array.axes - 1;
+            for (place[a]++; a > 0 && place[a] == to[a]; place[a]++) {
+                place[a] = from[a];
+                a--;
+            }
+        }
+        return true;
+    }
+};
+
+// Adds chunks that a reader who goes on wants next, one for each thread without work.
+static void add_ahead(fhash_file& file, const Grid& grid, Indices& indices,
+                      std::vector<Wanted>& wanted) {
+    const Array& array = grid.array;
+    const int64_t layers = layers_after(file, array, grid.first, grid.last);
+    const uint64_t each = array.inner_values() * fhash_type_size(array.type);
+    // They and those of the read take half of the cache at most.
+    const uint64_t most = std::min(uint64_t(file.context->threads), file.cache.limit / each / 2);
+    if (!layers || wanted.empty() || !array.sharded) return;
+    Lengths from = grid.first, to = grid.last;
+    from[0] = grid.last[0];
+    to[0] = std::min(from[0] + layers, array.count(array.inner, 0));
+    if (from[0] >= to[0]) return;
+    std::vector<Wanted> after;
+    grid.each(from, to, [&](const Lengths& place) {
+        const uint64_t number = grid.number(place);
+        if (wanted.size() + after.size() >= most) return false;
+        if (!file.cache.get({array.number, number, 0}) &&
+            !file.cache.get({array.number, number, UNCORRECTED}))
+            after.push_back({place, number, true, {}, 0});
+        return true;
+    });
+    fhash_error ignored;  // what fails now fails again once it is wanted
+    if (indices.locate_all(after, ignored))
+        wanted.insert(wanted.end(), after.begin(), after.end());
 }
 
-bool read_region(fhash_file& file, const Array& array, const Region& region, Buffer& values,
-                 Buffer* mask, fhash_error& error) {
+bool visit_chunks(fhash_file& file, const Array& array, const Region& region, const Manner& manner,
+                  const Visit& visit, fhash_error& error) {
+    const Grid grid(array, region);
+    if (!may_use(*file.context, grid.count * sizeof(Wanted), error)) return false;
+    std::vector<Wanted> wanted;
+    const auto look = [&](const Lengths& place) {
+        if (!grid.touches(place)) return true;
+        const Cache::Key key = {array.number, grid.number(place), uint64_t(manner.lod)};
+        ChunkPointer kept = file.cache.get(key);
+        const bool apart = !kept && !manner.lod && is_parted(array);
+        if (apart && !find_whole(file, array, key, kept, error)) return false;
+        if (!kept) wanted.push_back({place, key[1], false, {}, 0});
+        return !kept || visit(place, *kept);
+    };
+    if (!grid.each(grid.first, grid.last, look)) return false;
+    Indices indices{file, array};
+    if (!wanted.empty() && !indices.locate_all(wanted, error)) return false;
+    if (manner.ahead) add_ahead(file, grid, indices, wanted);
+    return wanted.empty() || Reading{file, array, region, manner, visit}.read(wanted, error);
+}
+
+bool find_stored(fhash_file& file, const Array& array, const Region& region,
+                 std::vector<Stored>& found, fhash_error& error) {
+    const Grid grid(array, region);
+    if (!may_use(*file.context, grid.count * sizeof(Wanted), error)) return false;
+    std::vector<Wanted> wanted;
+    grid.each(grid.first, grid.last, [&](const Lengths& place) {
+        wanted.push_back({place, grid.number(place), false, {}, 0});
+        return true;
+    });
+    Indices indices{file, array};
+    if (!indices.locate_all(wanted, error)) return false;
+    for (const Wanted& each : wanted) found.push_back(each.stored);
+    return true;
+}
+
+bool read_into(fhash_file& file, const Array& array, const Region& region, const Manner& manner,
+               uint8_t* values, uint8_t* mask, fhash_error& error) {
     const size_t item = fhash_type_size(array.type);
-    const uint64_t count = region.size(array.axes);
-    if (!may_use(*file.context, count * (item + 1), error)) return false;
-    values.resize(size_t(count * item));
-    if (mask) mask->assign(size_t(count), 1);
     Lengths shape = {};
     for (int a = 0; a < array.axes; a++) shape[a] = region.last[a] - region.first[a];
     const Lengths strides = strides_of(shape, array.axes);
@@ -507,14 +670,24 @@ bool read_region(fhash_file& file, const Array& array, const Region& region, Buf
             from += uint64_t((low - start - chunk.first[a]) * own[a]);
             to += uint64_t((low - region.first[a]) * strides[a]);
         }
-        copy_region(chunk.values.data() + from * item, own, values.data() + to * item, strides,
-                    counts, array.axes, item);
+        if (values)
+            copy_region(chunk.values.data() + from * item, own, values + to * item, strides,
+                        counts, array.axes, item);
         if (mask && !chunk.mask.empty())
-            copy_region(chunk.mask.data() + from, own, mask->data() + to, strides, counts,
-                        array.axes, 1);
+            copy_region(chunk.mask.data() + from, own, mask + to, strides, counts, array.axes, 1);
         return true;
     };
-    return visit_chunks(file, array, region, 0, visit, error);
+    return visit_chunks(file, array, region, manner, visit, error);
+}
+
+bool read_region(fhash_file& file, const Array& array, const Region& region, Buffer& values,
+                 Buffer* mask, fhash_error& error) {
+    const size_t item = fhash_type_size(array.type);
+    const uint64_t count = region.size(array.axes);
+    if (!may_use(*file.context, count * (item + 1), error)) return false;
+    values.resize(size_t(count * item));
+    if (mask) mask->assign(size_t(count), 1);
+    return read_into(file, array, region, {}, values.data(), mask ? mask->data() : nullptr, error);
 }
 
 }  // namespace fhash

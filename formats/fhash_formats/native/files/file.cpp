@@ -4,6 +4,7 @@
 #include <cstring>
 #include <new>
 
+#include "arrays.hpp"
 #include "volume.hpp"
 
 #if defined(_WIN32)
@@ -24,7 +25,10 @@ bool open_file(fhash_file& file, fhash_error& error) {
         !read_hierarchy(file.source, file.directory, file.hierarchy, error) ||
         !read_variables(file.hierarchy, file.variables, error))
         return false;
-    return json_text(yyjson_obj_get(file.hierarchy.root, "fhash"), file.header) ||
+    file.opened->numbered.resize(file.hierarchy.arrays.size());
+    for (const auto& each : file.hierarchy.arrays)
+        file.opened->numbered[each.second.number - 1] = &each.second;
+    return json_text(yyjson_obj_get(file.hierarchy.root, "fhash"), file.opened->header) ||
            fail(error, FHASH_ERROR_MEMORY, "no memory for the header");
 }
 
@@ -56,9 +60,9 @@ int64_t tell(std::FILE* stream) {
 }
 
 int32_t read_stream(void* user, uint64_t offset, uint64_t length, void* bytes) {
-    fhash_file& file = *static_cast<fhash_file*>(user);
-    std::FILE* const stream = static_cast<std::FILE*>(file.stream);
-    Guard guard(file.stream_lock);  // threads share the position
+    Opened& opened = *static_cast<Opened*>(user);
+    std::FILE* const stream = static_cast<std::FILE*>(opened.stream);
+    Guard guard(opened.stream_lock);  // threads share the position
     return !seek(stream, offset, SEEK_SET) ||
            std::fread(bytes, 1, size_t(length), stream) != size_t(length);
 }
@@ -111,23 +115,27 @@ bool read_positions(fhash_file& file, const Variable& variable, int axis, double
 
 using namespace fhash;
 
-int32_t fhash_open(fhash_context* context, fhash_read_function read, void* user, uint64_t size,
-                   fhash_file** file, fhash_error* error) {
+int32_t fhash_file_open(fhash_context* context, fhash_read_function read, Announce announce,
+                        void* user, uint64_t size, fhash_file** file, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         if (!context || !read || !file)
             return fail(failed, FHASH_ERROR_ARGUMENT, "a context, a function and a place for the "
                                                       "file are needed");
         *file = nullptr;
-        std::unique_ptr<fhash_file> made(new (std::nothrow) fhash_file());
-        if (!made) return fail(failed, FHASH_ERROR_MEMORY, "no memory");
-        made->context = context;
+        std::unique_ptr<fhash_file> made(new fhash_file(context, std::make_shared<Opened>()));
         made->source.function = read;
+        made->source.announced = announce;
         made->source.user = user;
         made->source.size = size;
         if (!open_file(*made, failed)) return false;
         *file = made.release();
         return true;
     });
+}
+
+int32_t fhash_open(fhash_context* context, fhash_read_function read, void* user, uint64_t size,
+                   fhash_file** file, fhash_error* error) {
+    return fhash_file_open(context, read, nullptr, user, size, file, error);
 }
 
 int32_t fhash_open_path(fhash_context* context, const char* path, fhash_file** file,
@@ -137,14 +145,12 @@ int32_t fhash_open_path(fhash_context* context, const char* path, fhash_file** f
             return fail(failed, FHASH_ERROR_ARGUMENT, "a context, a path and a place for the file "
                                                       "are needed");
         *file = nullptr;
-        std::unique_ptr<fhash_file, void (*)(fhash_file*)> made(new (std::nothrow) fhash_file(),
-                                                                fhash_close);
-        if (!made) return fail(failed, FHASH_ERROR_MEMORY, "no memory");
+        std::unique_ptr<fhash_file, void (*)(fhash_file*)> made(
+            new fhash_file(context, std::make_shared<Opened>()), fhash_close);
         std::FILE* const stream = open_stream(path);
-        made->context = context;
-        made->stream = stream;
+        made->opened->stream = stream;
         made->source.function = read_stream;
-        made->source.user = made.get();
+        made->source.user = made->opened.get();
         if (!stream || !seek(stream, 0, SEEK_END) || tell(stream) < 0)
             return fail(failed, FHASH_ERROR_READ, "the file cannot be opened");
         made->source.size = uint64_t(tell(stream));
@@ -155,11 +161,11 @@ int32_t fhash_open_path(fhash_context* context, const char* path, fhash_file** f
 }
 
 void fhash_close(fhash_file* file) {
-    if (file && file->stream) std::fclose(static_cast<std::FILE*>(file->stream));
+    if (file && file->opened->stream) std::fclose(static_cast<std::FILE*>(file->opened->stream));
     delete file;
 }
 
-const char* fhash_header(const fhash_file* file) { return file ? file->header.c_str() : nullptr; }
+const char* fhash_header(const fhash_file* file) { return file ? file->opened->header.c_str() : nullptr; }
 
 int32_t fhash_variables(const fhash_file* file) {
     return file ? int32_t(file->variables.size()) : 0;
@@ -208,14 +214,15 @@ int32_t fhash_coordinate(fhash_file* file, int32_t number, int32_t axis, double*
         if (!attributes) return true;
         std::string text;
         if (!describe(variable, axis, text, failed)) return false;
-        Guard guard(file->lock);
-        for (const std::string& known : file->texts)
+        Opened& opened = *file->opened;
+        Guard guard(opened.lock);
+        for (const std::string& known : opened.texts)
             if (known == text) {
                 *attributes = known.c_str();
                 return true;
             }
-        file->texts.push_back(text);
-        *attributes = file->texts.back().c_str();
+        opened.texts.push_back(text);
+        *attributes = opened.texts.back().c_str();
         return true;
     });
 }

@@ -264,7 +264,9 @@ bool check_arrays(const Variable& variable, fhash_error& error) {
             return false;
         if (masked && (variable.find("occupancy/bits") || features > 8 ||
                        variable.model.find("sparse")))
-            return fail(error, FHASH_ERROR_DAMAGED, "array occupancy/mask may not be there");
+            return fail(error, FHASH_ERROR_DAMAGED,
+                        "array occupancy/mask is there beside occupancy/bits, in a file of sparse "
+                        "tables, or of more than 8 features");
     }
     const bool transform = has_feature(variable.top, "transform");
     for (const auto& each : variable.arrays) {
@@ -397,6 +399,13 @@ template <class Float, class Whole> Float moved(Float value, int64_t by) {
 
 }  // namespace
 
+// A shape as text: "(4, 3)", "(4,)".
+static std::string shape_text(const std::vector<int64_t>& shape) {
+    std::string text;
+    for (const int64_t length : shape) text += (text.empty() ? "(" : ", ") + std::to_string(length);
+    return text + (shape.size() == 1 ? ",)" : ")");
+}
+
 const Array* Variable::find(const std::string& array) const {
     const auto found = arrays.find(array);
     return found == arrays.end() ? nullptr : found->second;
@@ -410,8 +419,13 @@ bool check_array(const Variable& variable, const char* name, const std::vector<i
     const bool fits = size_t(array->axes) == shape.size() &&
                       std::equal(shape.begin(), shape.end(), array->shape.begin()) &&
                       std::count(types.begin(), types.end(), array->type);
-    return fits || fail(error, FHASH_ERROR_DAMAGED,
-                        "array %s has not the shape and type that the header asks for", name);
+    if (fits) return true;
+    std::string wanted;
+    for (const int32_t type : types) wanted += (wanted.empty() ? "" : " or ") + name_of_type(type);
+    const std::vector<int64_t> own(array->shape.begin(), array->shape.begin() + array->axes);
+    return fail(error, FHASH_ERROR_DAMAGED, "array %s is %s %s; the header asks for %s %s", name,
+                name_of_type(array->type).c_str(), shape_text(own).c_str(), wanted.c_str(),
+                shape_text(shape).c_str());
 }
 
 bool check_format(Json header, fhash_error& error) {
@@ -422,10 +436,8 @@ bool check_format(Json header, fhash_error& error) {
         !top.need(format == "fhash", "format", "fhash", error) ||
         !top.integers("format_version", 2, 0, 10000, version, error))
         return false;
-    if (version[0] != 2)
-        return fail(error, FHASH_ERROR_UNSUPPORTED,
-                    "the file is of format %d.%d; this library reads format 2.x", int(version[0]),
-                    int(version[1]));
+    if (version[0] != MAJOR)
+        return refuse_version(int(version[0]), error);
     const Json list = top.find("required_features");
     if (!top.need(yyjson_is_arr(list), "required_features", "a list of texts", error)) return false;
     std::vector<std::string> names;
@@ -437,11 +449,17 @@ bool check_format(Json header, fhash_error& error) {
             return false;
         if (std::none_of(FEATURES, FEATURES + 4, [&](const char* known) { return name == known; }))
             return fail(error, FHASH_ERROR_UNSUPPORTED,
-                        "the file needs the feature %s, which this library does not know",
+                        "the file needs the feature %s, which this version does not know: upgrade, or "
+                    "encode the source again",
                         shown(name.c_str()).c_str());
         names.push_back(name);
     }
     return true;
+}
+
+// Fails, with the name of a variable that is one of several.
+static bool in_variable(const std::vector<Variable>& all, size_t number, fhash_error& error) {
+    return all.size() > 1 && fail_in(error, "variable '" + shown(all[number].name.c_str()) + "'");
 }
 
 bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error) {
@@ -464,16 +482,16 @@ bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fh
             (variable.header.find("name") &&
              !variable.header.text("name", variable.name, error)) ||
             !top.need(names.insert(variable.name).second, "variables",
-                      "of names that stand once", error) ||
-            !read_header(variable, error) || !places.read_names(i, error))
+                      "of names that stand once", error))
             return false;
+        if (!read_header(variable, error) || !places.read_names(i, error))
+            return in_variable(found, i, error);
     }
     if (!places.place_own(error)) return false;
     for (size_t i = 0; i < count; i++)
         if (!places.share(i, error) || !places.add_coordinates(found[i], error) ||
             !check_arrays(found[i], error))
-            return count == 1 ? false
-                              : fail_in(error, "variable " + shown(found[i].name.c_str()));
+            return in_variable(found, i, error);
     return true;
 }
 

@@ -293,7 +293,7 @@ bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice
                    });
         return true;
     };
-    if (!visit_chunks(file, table, region, lattice.lod, visit, error)) return false;
+    if (!visit_chunks(file, table, region, {lattice.lod}, visit, error)) return false;
     const bool lost = lattice.lod && has_nan(frame);
     if (!lattice.lod || !(masked || lost)) return true;
     // A tile of labels that begins between coarse vertices gives a vertex beside each of them,
@@ -315,7 +315,7 @@ bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice
                    });
         return true;
     };
-    return visit_chunks(file, table, region, 0, restore, error);
+    return visit_chunks(file, table, region, {}, restore, error);
 }
 
 bool add_occupancy(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,

@@ -346,6 +346,7 @@ struct Documents {
     const Source& source;
     const Directory& directory;
     std::map<std::string, Json> nodes;  // by path
+    std::map<std::string, std::string> texts;
     std::vector<JsonDocument>& kept;
 
     static std::string path_of(const Member& member) {
@@ -368,15 +369,14 @@ struct Documents {
         return good || fail_in(error, "member " + member.name);
     }
 
-    // Parses a document from its local header, name and data. `text`: null, or gets the document.
-    bool parse(const Member& member, const uint8_t* stored, std::string* text,
-               fhash_error& error) {
+    // Parses a document from its local header, name and data.
+    bool parse(const Member& member, const uint8_t* stored, fhash_error& error) {
         Buffer bytes;
         if (!open_member(member, stored, bytes, error)) return false;
         JsonDocument document;
         if (!parse_json(bytes.data(), bytes.size(), *source.context, document, error))
             return fail_in(error, "member " + member.name);
-        if (text) text->assign(bytes.begin(), bytes.end());
+        texts[path_of(member)].assign(bytes.begin(), bytes.end());
         kept.push_back(document);
         return add(member, yyjson_doc_get_root(document.get()), error);
     }
@@ -386,28 +386,29 @@ struct Documents {
         Buffer bytes;
         if (!source.read(start, together.back()->end() - start, bytes, error)) return false;
         for (const Member* member : together)
-            if (!parse(*member, bytes.data() + (member->offset - start), nullptr, error))
+            if (!parse(*member, bytes.data() + (member->offset - start), error))
                 return false;
         return true;
     }
 
     // Takes documents from the root's copies of them, where these are the same byte by byte: the
     // directory has their checksums. They need not be read.
-    bool take_copies(const std::string& root, fhash_error& error) {
-        const auto texts =
-            value_texts(value_texts(value_texts(root)["consolidated_metadata"])["metadata"]);
+    bool take_copies(fhash_error& error) {
+        const auto found =
+            value_texts(value_texts(value_texts(texts[""])["consolidated_metadata"])["metadata"]);
         const Json copies = yyjson_obj_get(
             yyjson_obj_get(nodes.at(""), "consolidated_metadata"), "metadata");
         yyjson_obj_iter iter = yyjson_obj_iter_with(copies);
         while (Json key = yyjson_obj_iter_next(&iter)) {
             const std::string path = yyjson_get_str(key);
             const Member* const member = directory.find(path + "/zarr.json");
-            const auto text = texts.find(path);
-            if (!member || text == texts.end()) continue;
+            const auto text = found.find(path);
+            if (!member || text == found.end()) continue;
             const uint64_t size =
                 member->full_size < 0 ? member->size : uint64_t(member->full_size);
             const uint8_t* const bytes = reinterpret_cast<const uint8_t*>(text->second.data());
             if (size != text->second.size() || crc_32(bytes, size_t(size)) != member->crc) continue;
+            texts[path] = text->second;
             if (!add(*member, yyjson_obj_iter_get_val(key), error)) return false;
         }
         return true;
@@ -417,31 +418,36 @@ struct Documents {
         const Member* const member = directory.find("zarr.json");
         if (!member) return damaged(error, "member zarr.json is missing");
         Buffer bytes;
-        std::string text;
         if (!source.read(member->offset, member->end() - member->offset, bytes, error) ||
-            !parse(*member, bytes.data(), &text, error))
+            !parse(*member, bytes.data(), error))
             return false;
         return !yyjson_is_obj(yyjson_obj_get(nodes.at(""), "consolidated_metadata")) ||
-               take_copies(text, error);
+               take_copies(error);
     }
 
     bool read(fhash_error& error) {
-        std::vector<const Member*> together;
-        uint64_t total = 0;
         if (!read_root(error)) return false;
+        std::vector<std::vector<const Member*>> spans;
+        uint64_t total = 0;
         for (const Member& member : directory.members) {
             if (!is_document(member.name) || nodes.count(path_of(member))) continue;
             total += member.full_size < 0 ? member.size : uint64_t(member.full_size);
-            if (member.size > MAX_DOCUMENT) return damaged(error, "metadata of over 2^24 bytes");
+            if (member.size > MAX_DOCUMENT)
+                return fail(error, FHASH_ERROR_DAMAGED, "member %s: metadata of over 2^24 bytes",
+                            member.name.c_str());
             if (!may_use(*source.context, total, error)) return false;
-            if (!together.empty() && (member.offset - together.back()->end() > DOCUMENT_GAP ||
-                                      member.end() - together.front()->offset > DOCUMENT_READ)) {
-                if (!read_span(together, error)) return false;
-                together.clear();
-            }
-            together.push_back(&member);
+            if (spans.empty() || member.offset - spans.back().back()->end() > DOCUMENT_GAP ||
+                member.end() - spans.back().front()->offset > DOCUMENT_READ)
+                spans.emplace_back();
+            spans.back().push_back(&member);
         }
-        return together.empty() || read_span(together, error);
+        std::vector<uint64_t> ranges;
+        for (const auto& span : spans)
+            ranges.insert(ranges.end(),
+                          {span.front()->offset, span.back()->end() - span.front()->offset});
+        source.announce(ranges);
+        return std::all_of(spans.begin(), spans.end(),
+                           [&](const auto& span) { return read_span(span, error); });
     }
 };
 
@@ -471,6 +477,8 @@ int32_t type_of_name(const char* name) {
     return 0;
 }
 
+std::string name_of_type(int32_t type) { return TYPES[type]; }
+
 const Array* Hierarchy::find(const std::string& path) const {
     const auto found = arrays.find(path);
     return found == arrays.end() ? nullptr : &found->second;
@@ -478,8 +486,14 @@ const Array* Hierarchy::find(const std::string& path) const {
 
 bool read_hierarchy(const Source& source, const Directory& directory, Hierarchy& found,
                     fhash_error& error) {
-    Documents documents{source, directory, {}, found.documents};
+    Documents documents{source, directory, {}, {}, found.documents};
     if (!documents.read(error)) return false;
+    for (uint32_t number = 0; number < directory.members.size(); number++) {
+        const Member& member = directory.members[number];
+        if (!is_document(member.name)) continue;
+        const std::string path = Documents::path_of(member);
+        found.nodes.push_back({path, std::move(documents.texts[path]), number});
+    }
     const auto is_group = [&](const std::string& path) {
         const auto node = documents.nodes.find(path);
         return node != documents.nodes.end() &&

@@ -12,6 +12,7 @@ namespace fhash {
 namespace {
 
 constexpr uint64_t TAIL = 64 << 10;              // bytes that are read first
+constexpr uint64_t FAR_TAIL = 16 << 10;          // the same of a file whose reads are announced
 constexpr uint64_t MAX_DIRECTORY = 1 << 28;      // bytes of the directory
 constexpr uint64_t MAX_MEMBER = uint64_t(1) << 31;
 constexpr uint64_t MAX_INFLATED = 16 << 20;    // bytes of an inflated member
@@ -220,7 +221,7 @@ bool parse_entries(const Buffer& bytes, const End& end, Directory& found, fhash_
 }  // namespace
 
 bool Source::read_tail(fhash_error& error) {
-    const uint64_t length = std::min(size, TAIL);
+    const uint64_t length = std::min(size, announced ? FAR_TAIL : TAIL);
     Buffer bytes;
     if (!read(size - length, length, bytes, error)) return false;
     tail = std::move(bytes);
@@ -259,11 +260,21 @@ bool is_document(const std::string& name) {
            0;
 }
 
-uint32_t crc_32(const uint8_t* data, size_t size) { return uint32_t(crc32_z(0, data, size)); }
+uint32_t crc_32(const uint8_t* data, size_t size, uint32_t begun) {
+    return uint32_t(crc32_z(begun, data, size));
+}
+
+uint64_t entry_size(const Member& member) { return directory_entry(member).size(); }
 
 const Member* Directory::find(const std::string& name) const {
     const auto found = numbers.find(name);
     return found == numbers.end() ? nullptr : &members[found->second];
+}
+
+bool refuse_version(int major, fhash_error& error) {
+    return fail(error, FHASH_ERROR_UNSUPPORTED,
+                "the file is of format %d.x; this version reads format %d.x: %s", major, MAJOR,
+                major > MAJOR ? "upgrade" : "encode the source again");
 }
 
 bool read_directory(Source& source, Directory& found, fhash_error& error) {
@@ -274,9 +285,8 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
         return fail(error, FHASH_ERROR_DAMAGED,
                     "not an fhash container, or one that was cut short: no fhash signature at its "
                     "end");
-    if (major != 2)
-        return fail(error, FHASH_ERROR_UNSUPPORTED,
-                    "the file is of format %d.x; this library reads format 2.x", major);
+    if (major != MAJOR)
+        return refuse_version(major, error);
     const uint64_t comment_at = source.tail_at + start;
     End end;
     Buffer directory;
@@ -286,9 +296,8 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
     if (!source.read(end.offset, comment_at - end.offset, directory, error)) return false;
     uint8_t digest[32];
     sha256(directory.data(), directory.size(), digest);
-    char text[65];
-    for (int i = 0; i < 32; i++) std::snprintf(text + 2 * i, 3, "%02x", digest[i]);
-    if (std::memcmp(text, source.tail.data() + source.tail.size() - 64, 64))
+    for (int i = 0; i < 32; i++) std::snprintf(found.digest + 2 * i, 3, "%02x", digest[i]);
+    if (std::memcmp(found.digest, source.tail.data() + source.tail.size() - 64, 64))
         return fail(error, FHASH_ERROR_DAMAGED,
                     "the ZIP directory is damaged: its SHA-256 differs from that in the comment");
     const Buffer records = end_records(end);
@@ -299,13 +308,17 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
     return parse_entries(directory, end, found, error);
 }
 
-bool check_member(const Member& member, const uint8_t* stored, fhash_error& error) {
+bool check_header(const Member& member, const uint8_t* stored, fhash_error& error) {
     const Buffer header = local_header(member);
-    if (std::memcmp(stored, header.data(), header.size()))
-        return fail(error, FHASH_ERROR_DAMAGED, "member %s: its header differs from the directory",
-                    member.name.c_str());
-    if (member.full_size < 0 &&
-        crc_32(stored + header.size(), size_t(member.size)) != member.crc)
+    return !std::memcmp(stored, header.data(), header.size()) ||
+           fail(error, FHASH_ERROR_DAMAGED, "member %s: its header differs from the directory",
+                member.name.c_str());
+}
+
+bool check_member(const Member& member, const uint8_t* stored, fhash_error& error) {
+    if (!check_header(member, stored, error)) return false;
+    const uint8_t* const data = stored + (member.data_offset() - member.offset);
+    if (member.full_size < 0 && crc_32(data, size_t(member.size)) != member.crc)
         return fail(error, FHASH_ERROR_DAMAGED,
                     "member %s: its CRC-32 differs, the data are damaged", member.name.c_str());
     return true;
