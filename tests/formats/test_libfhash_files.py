@@ -15,6 +15,7 @@ from unittest import mock
 import numpy as np
 import numpy.typing as npt
 import pytest
+from edited import edit
 from reference import rounding
 
 import fhash_codec
@@ -22,7 +23,6 @@ from fhash_codec import DamagedFileError, EncodeConfig, Volume, encoding
 from fhash_codec.compact import encode as compact
 from fhash_formats import native
 from fhash_formats.container import Container
-from fhash_formats.container import header as container_header
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.head import Layer, NeighbourHead
 
@@ -445,13 +445,16 @@ def test_integers_have_the_fill_value_where_they_have_no_value(tmp_path: Path) -
         assert_same(found, volume.values(1), None)
 
 
-def test_an_unknown_rule_is_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, values = tmp_path / "a.fhz", np.random.default_rng(9).normal(size=(3, 4, 5, 6))
-    with monkeypatch.context() as patch:
-        patch.setattr(compact, "choose_between", lambda *_: {"between": {"rule": "sinc"}})
-        patch.setattr(container_header, "CUBIC", "sinc")
-        fhash_codec.encode(values, path, EncodeConfig(max_error=0.1, effort=1))
-    with pytest.raises(DamagedFileError, match=r"model[.]between[.]rule is 'sinc'; needed: linear"):
+def test_an_unknown_rule_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.fhz"
+    path.write_bytes((GOLDEN / "compact-cubic.fhz").read_bytes())
+
+    def change(root):
+        root["attributes"]["fhash"]["variables"][0]["model"]["between"]["rule"] = "sinc"
+        return root
+
+    edit(path, "zarr.json", change)
+    with pytest.raises(DamagedFileError, match=r"model[.]between[.]rule is not linear or cubic"):
         fhash_codec.open(path)
     with pytest.raises(Refused, match="linear or cubic") as refused:
         Opened(path)

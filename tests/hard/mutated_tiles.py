@@ -30,7 +30,7 @@ from documents import (
 )
 from reference.sections import pack_planes
 
-from fhash_formats.container.array import ArrayMetadata, Sharding, pack_index, parse_index
+from fhash_formats.container.array import ENTRY_BYTES, ArrayMetadata, Sharding, pack_index
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
 from fhash_formats.errors import InputError
 from fhash_formats.native import crc32c
@@ -141,8 +141,9 @@ def inner_chunks(
         return OneTile(shard_shape=tile, chunk_shape=tile, codecs=()), np.ones(1, bool), [data]
     shard = tuple(int(i) for i in member[member.rindex("/c/") + 3 :].split("/"))
     present = sharding.present(shard, metadata.shape)
-    index = parse_index(data[-sharding.index_bytes :], present, len(data) - sharding.index_bytes)
-    return sharding, present, [data[offset : offset + size] for offset, size in index[present]]
+    index = np.frombuffer(data[-4 - present.size * ENTRY_BYTES : -4], "<u8").reshape(-1, 2)
+    places = index[present].tolist()
+    return sharding, present, [data[offset : offset + size] for offset, size in places]
 
 
 def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: Sequence[bytes]) -> bytes:

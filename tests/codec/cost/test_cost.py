@@ -245,7 +245,7 @@ def test_every_kind_is_read_and_compared(series: ArraySeries, file: KeptFile) ->
     coarse = [reads[f"level of detail {lod}"].psnr for lod in (1, 2, 3)]
     assert None not in coarse
     assert coarse == sorted(coarse, reverse=True)  # type: ignore[type-var]
-    assert reads["open"].bytes_read < reads["frame"].bytes_read
+    assert reads["open"].bytes_read <= reads["frame"].bytes_read
 
 
 def test_without_time_reads_are_left_out(series: ArraySeries, file: KeptFile) -> None:

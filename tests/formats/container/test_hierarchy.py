@@ -143,7 +143,7 @@ def test_a_newer_format_is_named_before_its_unknown_codecs(tmp_path, sample, sam
     path = tmp_path / "a.fhz"
     path.write_bytes(edited(sample, samples, ROOT, newer))
     refused(
-        path, edited(path, samples, DOCUMENT, unknown), "feature 'teleport'", UnsupportedFileError
+        path, edited(path, samples, DOCUMENT, unknown), "feature teleport", UnsupportedFileError
     )
 
 

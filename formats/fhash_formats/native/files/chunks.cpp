@@ -271,7 +271,9 @@ struct Indices {
 
     // The first and the last number of some inner chunks in their shard.
     static std::pair<uint64_t, uint64_t> ends(const std::vector<Wanted*>& of) {
-        const auto order = [](const Wanted* a, const Wanted* b) { return a->in_shard < b->in_shard; };
+        const auto order = [](const Wanted* a, const Wanted* b) {
+            return a->in_shard < b->in_shard;
+        };
         const auto found = std::minmax_element(of.begin(), of.end(), order);
         return {(*found.first)->in_shard, (*found.second)->in_shard};
     }
@@ -387,8 +389,9 @@ struct Reading {
     bool take(const Wanted& wanted, const Decoded& decoded) {
         const bool apart = decoded.table != nullptr;
         if (manner.keep)
-            file.cache.put({array.number, wanted.number, apart ? UNCORRECTED : uint64_t(manner.lod)},
-                           apart ? decoded.table : decoded.chunk);
+            file.cache.put(
+                {array.number, wanted.number, apart ? UNCORRECTED : uint64_t(manner.lod)},
+                apart ? decoded.table : decoded.chunk);
         return wanted.ahead || visit(wanted.place, *decoded.chunk);
     }
 

@@ -165,7 +165,9 @@ void fhash_close(fhash_file* file) {
     delete file;
 }
 
-const char* fhash_header(const fhash_file* file) { return file ? file->opened->header.c_str() : nullptr; }
+const char* fhash_header(const fhash_file* file) {
+    return file ? file->opened->header.c_str() : nullptr;
+}
 
 int32_t fhash_variables(const fhash_file* file) {
     return file ? int32_t(file->variables.size()) : 0;

@@ -240,6 +240,14 @@ bool check_plain(const Variable& variable, fhash_error& error) {
             !check_array(variable, ("mlp/bias_" + number).c_str(), {widths.outputs(layer)},
                          {FHASH_FLOAT32}, true, error))
             return false;
+        for (const char* kind : {"weight_", "bias_"}) {
+            const std::string name = std::string("mlp/") + kind + number;
+            const Record unit = {variable.find(name)->attributes, "array " + name + " attribute "};
+            double scale = 0;
+            if (!unit.number("scale", scale, error) ||
+                !unit.need(scale > 0, "scale", "above 0", error))
+                return false;
+        }
     }
     return true;
 }

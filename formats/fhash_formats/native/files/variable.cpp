@@ -447,10 +447,10 @@ bool check_format(Json header, fhash_error& error) {
         if (!top.need(!name.empty() && !std::count(names.begin(), names.end(), name),
                       "required_features", "a list of texts that stand once", error))
             return false;
-        if (std::none_of(FEATURES, FEATURES + 4, [&](const char* known) { return name == known; }))
+        if (std::find(std::begin(FEATURES), std::end(FEATURES), name) == std::end(FEATURES))
             return fail(error, FHASH_ERROR_UNSUPPORTED,
-                        "the file needs the feature %s, which this version does not know: upgrade, or "
-                    "encode the source again",
+                        "the file needs the feature %s, which this version does not know: "
+                        "upgrade, or encode the source again",
                         shown(name.c_str()).c_str());
         names.push_back(name);
     }

@@ -13,7 +13,7 @@ constexpr uint64_t MAX_CHUNK_BYTES = 1 << 30;     // of a decoded inner chunk
 constexpr uint64_t MAX_TILE = 1 << 27;            // vertices
 constexpr uint64_t MAX_SHARD_CHUNKS = 1 << 20;
 constexpr uint64_t MAX_DOCUMENT = 16 << 20;
-constexpr uint64_t DOCUMENT_GAP = 64 << 10;   // bytes between documents that are read as well
+constexpr uint64_t DOCUMENT_GAP = 16 << 10;   // bytes between documents that are read as well
 constexpr uint64_t DOCUMENT_READ = 16 << 20;  // bytes of a read of several documents
 const char* const TYPES[12] = {"",       "int8",   "int16",  "int32",   "int64",   "uint8",
                                "uint16", "uint32", "uint64", "float16", "float32", "float64"};
