@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import datetime
 import os
 import platform
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from fhash_codec.native.network import machine_paths
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
+from fhash_formats.native import ffi
 from fhash_formats.support.threads import at_most, usable_threads
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def may_have_cuda() -> bool:
     if not has_torch():
         return False
     try:
-        ctypes.CDLL(DRIVER)
+        ffi.dlopen(DRIVER)
     except OSError:
         return False
     return True
