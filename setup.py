@@ -32,12 +32,15 @@ CODEC = Path("fhash_codec/native")
 """Sources of the codec's library."""
 NETWORK = CODEC / "network"
 """Sources of the library that trains and evaluates the paper's network."""
+FUSED = Path("fhash_codec/paper/engines/fused")
+"""Kernels of CUDA, which are compiled where they run."""
 DECLARED = {
     "fhash_formats.native": (FORMATS / "fhash.h", FORMATS / "functions.h"),
     "fhash_codec.native": (CODEC / "codec.h",),
     "fhash_codec.native.network": (NETWORK / "network.h",),
+    "fhash_codec.paper.engines.fused": (FUSED / "driver.h", FUSED / "kernels/records.h"),
 }
-"""Packages with a library, and the headers from which their module `declarations` is made."""
+"""Packages that call C, and the headers from which their module `declarations` is made."""
 TARGET = os.environ.get("FHASH_TARGET", "")
 """Machine to compile for, in zig's words; empty for this one."""
 

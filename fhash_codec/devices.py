@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -102,10 +103,16 @@ def may_have_cuda() -> bool:
     if not has_torch():
         return False
     try:
-        ffi.dlopen(DRIVER)
+        _driver()
     except OSError:
         return False
     return True
+
+
+@cache
+def _driver() -> Any:
+    """Return the driver's library, which stays loaded; OSError where there is none."""
+    return ffi.dlopen(DRIVER)
 
 
 def has_torch() -> bool:
