@@ -1,7 +1,8 @@
 """The native libraries: C++ of `fhash_formats.native`, `fhash_codec.native`, its `network`.
 
-They are plain shared libraries for ctypes, without Python's headers: one wheel serves every Python.
-The rest of the build is described in pyproject.toml. Where the machine has no C++ compiler, that of
+They are plain shared libraries, without Python's headers: one wheel serves every Python. What cffi
+must know of them is taken from their headers, as a module of Python beside each (`DECLARED`). The
+rest of the build is described in pyproject.toml. Where the machine has no C++ compiler, that of
 the package ziglang is used (build_backend.py); it also compiles for other machines, where
 FHASH_TARGET names one by zig's words, such as aarch64-linux-musl (`make wheels`).
 """
@@ -17,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
+from cffi import FFI
 from setuptools import Command, Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
@@ -30,6 +32,15 @@ CODEC = Path("fhash_codec/native")
 """Sources of the codec's library."""
 NETWORK = CODEC / "network"
 """Sources of the library that trains and evaluates the paper's network."""
+FUSED = Path("fhash_codec/paper/engines/fused")
+"""Kernels of CUDA, which are compiled where they run."""
+DECLARED = {
+    "fhash_formats.native": (FORMATS / "fhash.h", FORMATS / "functions.h"),
+    "fhash_codec.native": (CODEC / "codec.h",),
+    "fhash_codec.native.network": (NETWORK / "network.h",),
+    "fhash_codec.paper.engines.fused": (FUSED / "driver.h", FUSED / "kernels/records.h"),
+}
+"""Packages that call C, and the headers from which their module `declarations` is made."""
 TARGET = os.environ.get("FHASH_TARGET", "")
 """Machine to compile for, in zig's words; empty for this one."""
 
@@ -125,6 +136,18 @@ def use_zig() -> None:
     os.environ |= {"CC": c, "CXX": cxx, "LDSHARED": shared, "LDCXXSHARED": shared}
 
 
+def declarations(headers: tuple[Path, ...]) -> str:
+    """What cffi reads of headers: C without a preprocessor, but for numbers.
+
+    A function that is not exported becomes a type of its name: `fhash_function` has its address.
+    """
+    text = "".join(header.read_text("utf-8") for header in headers)
+    text = re.sub(r"#ifdef __cplusplus\n.*?#endif\n", "", text, flags=re.DOTALL)
+    text = re.sub(r"^#(?!define \w+ +\d).*\n", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^(?=\w+ fhash_\w+\()", "typedef ", text, flags=re.MULTILINE)
+    return re.sub(r"^FHASH_(API|EXPORT) ", "", text, flags=re.MULTILINE)
+
+
 class BuildNative(build_ext):
     """`build_ext` of plain libraries, with the compiler that is there, all files side by side."""
 
@@ -138,6 +161,13 @@ class BuildNative(build_ext):
         if TARGET or not has_compiler():
             use_zig()
         super().run()
+        for package, headers in DECLARED.items():
+            path = Path(self.get_ext_fullpath(f"{package}.declarations")).with_suffix(".py")
+            ffi = FFI()
+            ffi.set_source(f"{package}.declarations", None)
+            ffi.cdef(declarations(headers))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            ffi.emit_python_code(str(path))
 
     def build_extensions(self) -> None:
         with ThreadPoolExecutor(os.cpu_count()) as pool:

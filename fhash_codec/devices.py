@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import datetime
 import os
 import platform
@@ -12,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from fhash_codec.native.network import machine_paths
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
+from fhash_formats.native import ffi
 from fhash_formats.support.threads import at_most, usable_threads
 
 if TYPE_CHECKING:
@@ -102,10 +103,16 @@ def may_have_cuda() -> bool:
     if not has_torch():
         return False
     try:
-        ctypes.CDLL(DRIVER)
+        _driver()
     except OSError:
         return False
     return True
+
+
+@cache
+def _driver() -> Any:
+    """Return the driver's library, which stays loaded; OSError where there is none."""
+    return ffi.dlopen(DRIVER)
 
 
 def has_torch() -> bool:

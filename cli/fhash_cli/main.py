@@ -77,6 +77,7 @@ class Program(click.Group):
         if name in DISTRIBUTIONS:
             return _of_distribution(name)
         module = importlib.import_module(f"fhash_cli.commands.{FILES.get(name, name)}")
+        _keep_freed_memory()
         attribute = f"{name.replace('-', '_')}_command" if name in FILES else "command"
         return cast(click.Command, getattr(module, attribute))
 
@@ -90,7 +91,6 @@ class Program(click.Group):
 
         Ctrl-C becomes an error here, before click prints lines of its own about it.
         """
-        _keep_freed_memory()
         with warnings.catch_warnings():
             warnings.showwarning = warn
             _show_own_warnings()
@@ -260,10 +260,10 @@ def _keep_freed_memory() -> None:
     It would give it back to the system, which clears it page by page: a twentieth of the seconds
     of an encoding, and more where threads wait for each other there.
     """
-    with suppress(ImportError, OSError, AttributeError):
-        import ctypes
+    with suppress(MissingDependencyError, OSError, AttributeError):
+        from fhash_formats.native import ffi
 
-        library = ctypes.CDLL(None)
+        library = ffi.dlopen(None)
         for parameter, value in MALLOC.items():
             library.mallopt(parameter, value)
 

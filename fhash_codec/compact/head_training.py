@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.measure.errors import pointer
+from fhash_codec.native import pointer
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.support.values import Double, Single
 from fhash_formats.transform.head import (
@@ -330,14 +329,14 @@ class Network:
             yield self.parameters[at:end].reshape(outputs, inputs), self.parameters[end:][:outputs]
             at = end + outputs
 
-    def _arguments(self, voxels: Batches) -> Sequence[ctypes.c_void_p]:
+    def _arguments(self, voxels: Batches) -> list[Any]:
         """Return the arguments of the native functions that describe the voxels."""
         batches, blocks, _, block = voxels.inputs.shape
-        sizes = (ctypes.c_int64 * 5)(batches, blocks, block, *self.widths)
-        arrays = voxels.inputs, voxels.targets, voxels.lowest, voxels.highest, voxels.weights
-        assert all(array.flags.c_contiguous for array in arrays)
-        addresses = [pointer(array) for array in arrays]
-        return [*addresses, ctypes.cast(sizes, ctypes.c_void_p)]
+        fields = ("inputs", "targets", "lowest", "highest", "weights")
+        return [
+            *(pointer(getattr(voxels, name)) for name in fields),
+            (batches, blocks, block, *self.widths),
+        ]
 
 
 def as_in_file(values: Double, most: int) -> Scaled:

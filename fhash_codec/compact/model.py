@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache, reduce
 from itertools import product
@@ -19,7 +18,7 @@ from fhash_codec.measure.value_range import decoded_type
 from fhash_formats.container import Container, StoredArray
 from fhash_formats.container.header import CUBIC, MISSING_ARRAY, PLAIN_FEATURE, TABLE
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.native import library
+from fhash_formats.native import library, pointer
 from fhash_formats.support.threads import chunk_region, common_part
 from fhash_formats.support.values import Double
 from fhash_formats.transform.head import Layer, NeighbourHead
@@ -365,13 +364,13 @@ def values_between(
     for start in range(0, values.size, piece):
         held = [None if each is None else _wide(each[start : start + piece]) for each in given]
         code = library().fhash_between(
-            (ctypes.c_void_p * 4)(*(None if each is None else each.ctypes.data for each in held)),
-            (ctypes.c_double * 2)(*distances),
+            list(map(pointer, held)),
+            distances,
             min(piece, values.size - start),
-            shares.ctypes.data,
+            pointer(shares),
             shares.size == 1,
-            values.ctypes.data + 8 * start,
-            None if derived is None else derived.ctypes.data + 8 * start,
+            pointer(values.reshape(-1)[start:]),
+            pointer(None if derived is None else derived.reshape(-1)[start:]),
         )
         assert code == 0
     return values, derived

@@ -6,7 +6,6 @@ few coded parts: which coder takes how many bytes, and the error that a trellis 
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -43,9 +42,10 @@ from fhash_codec.compact.transform import (
 )
 from fhash_codec.measure.value_range import Mean, ValueRange, mean_of
 from fhash_codec.progress import stage
+from fhash_formats.native import ffi, pointer
 from fhash_formats.support.values import Single
 from fhash_formats.transform.spec import KINDS, AxisTransform, TransformSpec
-from fhash_formats.transform.tile import call_with_context
+from fhash_formats.transform.tile import call
 from fhash_formats.transform.tile_format import Shape, TileSettings
 from fhash_formats.transform.values import all_finite
 
@@ -167,56 +167,6 @@ def block_of(shape: Shape, vertices: int) -> Shape:
     return t, z, y, x
 
 
-class _Parts(ctypes.Structure):
-    """fhash_plan_parts (native/planner.hpp)."""
-
-    _fields_ = (
-        ("shape", ctypes.c_int64 * 4),
-        ("count", ctypes.c_int64),
-        ("values", ctypes.c_void_p),
-        ("counted", ctypes.c_void_p),
-        ("weights", ctypes.c_void_p),
-    )
-
-
-class _Task(ctypes.Structure):
-    """fhash_plan_task (native/planner.hpp)."""
-
-    _fields_ = (
-        ("shape", ctypes.c_int64 * 4),
-        ("columns", _Parts),
-        ("sheets", _Parts),
-        ("block", _Parts),
-        ("lines", ctypes.c_void_p * 4),
-        ("line_counts", ctypes.c_int64 * 4),
-        ("tiles", ctypes.c_void_p),
-        ("works", ctypes.c_void_p),
-        ("tile_count", ctypes.c_int64),
-        ("worth", ctypes.c_double),
-        ("region_ns", ctypes.c_double),
-        ("vertex_ns", ctypes.c_double),
-        ("bit_ns", ctypes.c_double),
-        ("most", ctypes.c_double),
-        ("step", ctypes.c_double),
-        ("mean_square", ctypes.c_double),
-        ("size", ctypes.c_double),
-    )
-
-
-class _Result(ctypes.Structure):
-    """fhash_plan_result (native/planner.hpp)."""
-
-    _fields_ = (
-        ("tile", ctypes.c_int64 * 4),
-        ("kinds", ctypes.c_int32 * 4),
-        ("depths", ctypes.c_int32 * 4),
-        ("step", ctypes.c_double),
-        ("bytes", ctypes.c_double),
-        ("price", ctypes.c_double),
-        ("tried", ctypes.c_int64),
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Priced:
     """Plan of the native planner.
@@ -261,13 +211,14 @@ class _Held:
     def __init__(self) -> None:
         self._arrays: list[npt.NDArray[Any]] = []
 
-    def address(self, array: npt.NDArray[Any]) -> int:
-        """Return the address of an array."""
-        self._arrays.append(array)
-        return array.ctypes.data
+    def pointer(self, array: npt.NDArray[Any] | None) -> Any:
+        """Return a pointer to the numbers of an array; NULL for None."""
+        if array is not None:
+            self._arrays.append(array)
+        return pointer(array)
 
-    def parts(self, sample: Sample, settings: TileSettings, vertices: int) -> _Parts:
-        """Return the tiles of a sample as parts of a series of so many vertices."""
+    def parts(self, sample: Sample, settings: TileSettings, vertices: int) -> tuple[Any, ...]:
+        """Return the tiles of a sample as `fhash_plan_parts` of a series of so many vertices."""
         values = np.stack([about_center(tile.values, settings) for tile in sample.tiles])
         counted = None
         if any(tile.counted is not None for tile in sample.tiles):
@@ -275,14 +226,13 @@ class _Held:
                 np.ones(tile.values.shape, bool) if tile.counted is None else tile.counted
                 for tile in sample.tiles
             ]
-            counted = self.address(np.stack(masks).astype(np.uint8))
+            counted = np.stack(masks).astype(np.uint8)
         # Parts where no vertex counts are not in the sample, and stand for no bytes.
         weights = np.array(sample.weights, np.float64) * (vertices / prod(values.shape[1:]))
         weights /= (
             prod(sample.blocks.grid) / len(sample.blocks.weights) * sum(sample.blocks.weights)
         )
-        shape = (ctypes.c_int64 * 4)(*values.shape[1:])
-        return _Parts(shape, len(values), self.address(values), counted, self.address(weights))
+        return values.shape[1:], len(values), *map(self.pointer, (values, counted, weights))
 
 
 def priced_plan(
@@ -303,11 +253,11 @@ def priced_plan(
     config, goal, blocks = task.config, task.goal, task.blocks
     held, scale = _Held(), scale_of(settings)
     first, more = DECODING_NS["fast"]
-    given = _Task(
-        shape=(ctypes.c_int64 * 4)(*blocks.shape),
+    fields = dict(
+        shape=blocks.shape,
         columns=held.parts(columns, settings, prod(blocks.shape)),
-        tiles=held.address(np.array(tiles, np.int64)),
-        works=held.address(np.array([region_vertices(blocks.shape, tile) for tile in tiles])),
+        tiles=held.pointer(np.array(tiles, np.int64)),
+        works=held.pointer(np.array([region_vertices(blocks.shape, tile) for tile in tiles])),
         tile_count=len(tiles),
         worth=WORTH[config.access],
         region_ns=1e6 * REGION_MS[config.access],
@@ -318,6 +268,7 @@ def priced_plan(
         mean_square=(goal.expected_error * scale) ** 2 if goal.psnr is not None else 0.0,
         size=0.0 if goal.size is None else max(goal.size - goal.overhead, 1.0),
     )
+    given = ffi.new("fhash_plan_task *", fields)
     if sheets is not None:
         given.sheets = held.parts(sheets, settings, prod(blocks.shape))
     if block is not None:
@@ -326,9 +277,9 @@ def priced_plan(
         if blocks.in_memory and length > 1:
             whole = blocks.values_in_memory
             lines = lines_along(whole, axis, settings)
-            given.lines[axis], given.line_counts[axis] = held.address(lines), len(lines)
-    found = _Result()
-    call_with_context("fhash_plan", ctypes.byref(given), ctypes.byref(found))
+            given.lines[axis], given.line_counts[axis] = held.pointer(lines), len(lines)
+    found = ffi.new("fhash_plan_result *")
+    call("fhash_plan", given, found)
     t, z, y, x = found.tile
     return Priced(
         tile=(t, z, y, x),

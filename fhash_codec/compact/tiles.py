@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,6 +18,7 @@ import numpy as np
 from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
+from fhash_formats.native import ffi
 from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.threads import chunk_region, map_ahead, one_ahead, usable_threads
 from fhash_formats.support.values import Mask, Values
@@ -100,7 +100,7 @@ def return_memory() -> None:
     It keeps arrays of up to 32 MB: the planning's took a fifth of a series more, for nothing.
     """
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        trim = getattr(ffi.dlopen(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,8 +14,8 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks
-from fhash_codec.measure.errors import pointer
 from fhash_codec.measure.value_range import power_of_two
+from fhash_codec.native import pointer
 from fhash_codec.progress import stage
 from fhash_formats.transform.spec import (
     MAX_LENGTH,
@@ -235,11 +234,7 @@ def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
     flat = np.ascontiguousarray(coefficients, dtype=np.float32).reshape(-1)
     histogram = Magnitudes(counts=np.zeros(BINS, np.int64), squares=np.zeros(BINS))
     native.library().fhash_magnitudes(
-        pointer(flat),
-        ctypes.c_int64(flat.size),
-        ctypes.c_int64(SHIFT),
-        pointer(histogram.counts),
-        pointer(histogram.squares),
+        pointer(flat), flat.size, SHIFT, pointer(histogram.counts), pointer(histogram.squares)
     )
     return histogram
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -16,6 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.measure.value_range import Ranks, ValueRange, pieces, power_of_two
+from fhash_codec.native import pointer
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads, usable_threads
 from fhash_formats.support.values import Double, Mask, Values, exact_number, is_wide_integer
@@ -146,9 +146,8 @@ def histogram(
     for piece in pieces(values):
         wide = np.ascontiguousarray(piece if native_type else piece.astype(np.float64))
         function = getattr(native.library(), f"fhash_histogram_f{wide.dtype.itemsize * 8}")
-        numbers = (ctypes.c_double(number) for number in (scale, low, factor))
-        size, bins = ctypes.c_int64(wide.size), ctypes.c_int64(counts.size)
-        function(pointer(wide), size, *numbers, bins, pointer(counts))
+        numbers = (wide.size, scale, low, factor, counts.size)
+        function(pointer(wide), *numbers, pointer(counts))
 
 
 def _native_sums(
@@ -184,11 +183,6 @@ def _call(name: str, values: Values, *arguments: Any) -> None:
     """Call the native function of a name for the type of the values, which it gets first."""
     function = getattr(native.library(), f"fhash_{name}_f{values.dtype.itemsize * 8}")
     function(pointer(values), *arguments)
-
-
-def pointer(array: Values | None) -> ctypes.c_void_p:
-    """The address of an array's first number, as native functions take it; null for None."""
-    return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
 def _lane_sum(values: Double) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import time
 from collections import deque
@@ -22,10 +21,10 @@ from fhash_codec.measure.errors import (
     BulkQuality,
     Errors,
     StepErrors,
-    pointer,
     range_and_sum,
 )
 from fhash_codec.measure.value_range import ValueRange, pieces, power_of_two
+from fhash_codec.native import pointer
 from fhash_codec.progress import Progress, attribute, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import step_blocks
@@ -162,20 +161,20 @@ class _Frames:
     def similarity(self, tile: Tile) -> tuple[float, int]:
         """Sum of the similarity over a tile, and the number of vertices in the sum."""
         function = getattr(native.library(), f"fhash_ssim_f{8 * self.original.dtype.itemsize}")
-        total = ctypes.c_double()
+        total = native.ffi.new("double *")
         numbers = (self.scale, self.mean, self.c1, self.c2, *_weights()[RADIUS:])
         count = function(
             *map(pointer, (self.original, self.decoded, self.mask)),
-            (ctypes.c_int64 * 3)(*self.original.shape),
-            (ctypes.c_int64 * 6)(*(end for span in tile for end in span)),
-            (ctypes.c_double * len(numbers))(*numbers),
-            ctypes.byref(total),
+            self.original.shape,
+            [end for span in tile for end in span],
+            numbers,
+            total,
         )
         if count == -1:
             raise InputError(_NOT_FINITE)
         if count < 0:
             raise MemoryError(f"no memory to compare the frames' tile {tile}")
-        return total.value, count
+        return total[0], count
 
 
 def _cuts(start: int, stop: int, limit: int) -> list[tuple[int, int]]:

@@ -1,6 +1,7 @@
 // The ABI number that the loader checks.
 //
 // The rules of fhash_formats/native/core.hpp hold for all sources of this folder, too.
+#include "codec.h"
 #include "core.hpp"
 
 // Raise it whenever an exported signature or its meaning changes; native/__init__.py holds the same

@@ -9,6 +9,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "codec.h"
 #include "core.hpp"
 #include "guard.hpp"
 

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <vector>
 
+#include "codec.h"
 #include "core.hpp"
 #include "guard.hpp"
 

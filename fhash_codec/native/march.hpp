@@ -1,4 +1,4 @@
-// The input of the marcher, and values between vertices. Shared by march.cpp and its parts.
+// Values between vertices. Shared by march.cpp and its parts.
 #pragma once
 
 #include <algorithm>
@@ -8,94 +8,8 @@
 #include <cstring>
 #include <limits>
 
-#include "core.hpp"
+#include "codec.h"
 #include "target.hpp"
-
-constexpr int FHASH_SURFACES = 64;  // surfaces of a picture, at most
-constexpr int FHASH_POWERS = 1024;  // intervals of the table of highlights
-constexpr int FHASH_BRICK = 4;      // cells along a brick's side
-constexpr int FHASH_PLANES = 6;     // planes that clip a picture, at most
-constexpr int FHASH_GRADES = 1024;  // intervals of the table of factors by gradient
-constexpr int FHASH_POINTS = 64;    // points that a network is evaluated at together, at most
-
-// `fhash_network_points` of the network's library (network/points.cpp).
-using FhashNetwork = std::int64_t (*)(const std::int64_t* sizes, const std::int64_t* levels,
-                                      const std::int64_t* layers, const std::int64_t* columns,
-                                      std::int64_t count, std::int64_t path, float* values,
-                                      float* slopes, float* by_inputs);
-
-// Decodes what the samples in a brick read, and is nonzero where that fails.
-using FhashFetch = std::int64_t (*)(std::int64_t brick);
-
-// Mirrored field by field in fhash_codec/rendering/march.py. All places and directions
-// are in vertices of the frame, x, y, z.
-extern "C" struct FhashMarch {
-    // The frame.
-    const float* values;    // (z, y, x), NaN where there is none
-    std::int64_t shape[3];  // z, y, x
-    // What rays may leap over; null pointers where everything is looked at.
-    const std::int32_t* distance;  // (z, y, x) of bricks: distance to the nearest that matters
-    const std::uint32_t* cells;    // (z, y, x, 2) of bricks: bit x + 4 y + 16 z of a visible cell
-    const float* highest;          // (z, y, x) of bricks: largest value, for FLAGS & MAXIMUM
-    std::int64_t bricks[3];        // of FHASH_BRICK cells along a side; their number along z, y, x
-    // The transfer function.
-    const float* table;        // (entries + 1, 4): red, green, blue, opacity of one step
-    const double* extinction;  // (entries + 1,): of one step
-    std::int64_t entries;      // the last entry is in the tables twice
-    double low, scale;         // the entry of a value is (value - low) * scale
-    // The light grid.
-    const float* light;  // (z, y, x, 2): shares from the lamp and from around; null for all light
-    std::int64_t light_shape[3];  // z, y, x
-    double light_offset[3], light_scale;  // a place is at place * scale + offset in the light grid
-    // The rays.
-    double eye[3], right[3], up[3], forward[3];
-    double box[3][2];        // the drawn box as it is clipped, in which steps are counted
-    double seen[3][2];       // the part of the box in which the frame has values
-    double spacing[3];       // length of one vertex spacing; negative on a descending axis
-    std::int64_t width, height, parallel;
-    std::int64_t rays;       // rays along a pixel's side
-    double step;             // length of a step
-    double threshold;        // share of light behind at which a ray ends
-    std::int64_t jitter;     // whether the first sample is shifted by a share of the ray's own
-    // Phong's model.
-    double lamp[3];          // unit vector towards the light; zero for a light at the camera
-    double ambient, diffuse, specular;
-    double steep;            // stretches the table of highlights over the cosines next to 1
-    double gradient[3];      // for each axis, from differences to the gradients of shading
-    double floor;            // gradient at which shading has faded by half
-    const float* powers;     // (FHASH_POWERS + 2,): the highlight by (1 - cosine) * steep
-    // The surfaces: value, red, green, blue, opacity.
-    std::int64_t surfaces;
-    double surface[FHASH_SURFACES][5];
-    // The pictures.
-    float* out;              // (height, width, 4), multiplied by the opacity
-    float* depth;            // (height, width) or null
-    float* normal;           // (height, width, 3) or null
-    std::int64_t central;    // whether the gradients of shading are central differences
-    std::int64_t path;       // instructions: 0 the processor's, 1 at most AVX2, 2 the baseline
-    // Planes that clip the box: a place is kept where their first three numbers times the place
-    // are at least the fourth.
-    std::int64_t planes;
-    double plane[FHASH_PLANES][4];
-    // Opacity by gradient.
-    const float* grading;    // (FHASH_GRADES + 2,): factors of the extinction by gradient; or null
-    double grade_scale;      // entries of that table to a gradient of shading of 1
-    std::int64_t unlit;      // whether gradients are for opacity alone, not for shading
-    const float* smooth;     // (z, y, x): values whose central differences shade; or null
-    // A network with values of its own, in place of those of the frame, which then say where there
-    // is a value.
-    FhashNetwork network;    // null for none
-    const std::int64_t* network_sizes;
-    const std::int64_t* network_levels;
-    const std::int64_t* network_layers;
-    std::int64_t network_path;
-    std::int64_t network_whole;  // whether there is a value at all places of the frame
-    double network_low, network_span;  // the value of its 0, and the change to that of its 1
-    std::int64_t* network_status;      // takes what it returns where it fails
-    // A frame that is decoded while it is marched.
-    const std::int32_t* ready;  // (z, y, x) of bricks: whether what samples in it read is there; or
-    FhashFetch fetch;           // null where all is there
-};
 
 // `fhash_march` for a target.
 using FhashTiles = void(const FhashMarch& march, int flags, std::int64_t first, std::int64_t stop,

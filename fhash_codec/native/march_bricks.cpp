@@ -5,6 +5,7 @@
 #include <cstring>
 #include <limits>
 
+#include "codec.h"
 #include "core.hpp"
 
 namespace {

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <cstdlib>
 
+#include "codec.h"
 #include "core.hpp"
 
 namespace {

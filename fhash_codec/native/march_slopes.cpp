@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <limits>
 
+#include "codec.h"
 #include "core.hpp"
 
 namespace {

@@ -7,6 +7,7 @@
 #include <system_error>
 #include <thread>
 
+#include "codec.h"
 #include "guard.hpp"
 #include "train_head.hpp"
 

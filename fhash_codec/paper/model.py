@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from fhash_codec.boxes import CORNERS, Box, Mlp, Spans, Table
 from fhash_codec.features.occupancy import read_occupancy
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.native import network as native
+from fhash_codec.native.network import pointer
 from fhash_codec.paper.network import Network, RankedBits, Resolution, SparseFrame, row_bits
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
@@ -219,11 +219,11 @@ class PointTables:
             values = np.empty((1, *patch.values.shape[1:]), np.float32)
             facts = np.array(patch.facts(level), np.int64)
             status = library.fhash_network_still(
-                sizes.ctypes.data,
-                facts.ctypes.data,
-                float(key_index),
+                pointer(sizes),
+                pointer(facts),
+                key_index,
                 native.best_path(library) if path is None else path,
-                values.ctypes.data,
+                pointer(values),
             )
             _check_status(status)
             patches.append(patch.at_one_time(values))
@@ -463,9 +463,8 @@ class PointSampler:
 
     def fields(self) -> dict[str, Any]:
         """Fields by which the native marcher calls `fhash_network_points`, as long as this is."""
-        function = ctypes.cast(self._library.fhash_network_points, ctypes.c_void_p)
         return {
-            "network": function.value,
+            "network": self._library.fhash_network_points,
             "network_sizes": self._sizes,
             "network_levels": self._levels,
             "network_layers": self._layers,
@@ -510,8 +509,6 @@ class PointSampler:
             input_slopes: float32 (inputs, n), to be written: the derivatives by the inputs of the
                 network.
         """
-        results = (values, slopes, input_slopes)
-        assert all(result is None or result.flags.c_contiguous for result in results)
         places = np.array(
             [
                 (column.ctypes.data, 0 if len(column) == 1 else column.strides[0] // 8)
@@ -520,13 +517,10 @@ class PointSampler:
             np.int64,
         )
         status = self._library.fhash_network_points(
-            self._sizes.ctypes.data,
-            self._levels.ctypes.data,
-            self._layers.ctypes.data,
-            places.ctypes.data,
+            *map(pointer, (self._sizes, self._levels, self._layers, places)),
             len(values),
             self._path,
-            *(None if result is None else result.ctypes.data for result in results),
+            *map(pointer, (values, slopes, input_slopes)),
         )
         _check_status(status)
 

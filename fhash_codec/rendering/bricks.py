@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections import OrderedDict
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_codec.native import pointer
 from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Table, Task
 from fhash_formats.support.threads import in_threads
 from fhash_formats.support.values import Mask, Single
@@ -96,7 +96,7 @@ class Palette:
 
 Result = TypeVar("Result")
 
-SIDE = 4
+SIDE: int = native.ffi.integer_const("FHASH_BRICK")
 """Cells along a brick's side. With twice as many, a narrow interval takes twice the samples."""
 FARTHEST = 255
 """Largest distance of bricks, in bricks, and so the largest leap of a ray."""
@@ -220,23 +220,15 @@ def extremes(values: Single) -> tuple[Single, Single]:
     bricks = _counts(values)
     low, high = np.empty(bricks, dtype=np.float32), np.empty(bricks, dtype=np.float32)
     library = native.library()
-    shape, counts = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*bricks)
     assert values.strides[2] == values.itemsize
-    strides = (ctypes.c_int64 * 2)(*(stride // values.itemsize for stride in values.strides[:2]))
+    strides = [stride // values.itemsize for stride in values.strides[:2]]
+    first_value = native.ffi.cast("float *", values.ctypes.data)  # of a part of an array
 
     def layers(first: int, stop: int) -> None:
         scratch = np.empty(2 * values.shape[2], dtype=np.float32)
         library.fhash_march_bricks(
-            values.ctypes.data,
-            shape,
-            strides,
-            counts,
-            SIDE,
-            first,
-            stop,
-            low.ctypes.data,
-            high.ctypes.data,
-            scratch.ctypes.data,
+            *(first_value, values.shape, strides, bricks, SIDE, first, stop),
+            *map(pointer, (low, high, scratch)),
         )
 
     _in_turn(layers, bricks[0], values.size)
@@ -245,13 +237,13 @@ def extremes(values: Single) -> tuple[Single, Single]:
 
 def nearest(distance: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Put the distance from the nearest brick of 0 in place of larger numbers (z, y, x)."""
-    shape, library = (ctypes.c_int64 * 3)(*distance.shape), native.library()
+    library = native.library()
     layers, rows = library.fhash_march_distance_layers, library.fhash_march_distance_rows
     for count, function in zip(distance.shape, (layers, rows), strict=False):
 
         def find(first: int, stop: int, function: Callable[..., object] = function) -> None:
             scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
-            function(shape, distance.ctypes.data, first, stop, scratch.ctypes.data)
+            function(distance.shape, pointer(distance), first, stop, pointer(scratch))
 
         _in_turn(find, count, distance.size * SIDE**3)
     return distance
@@ -305,19 +297,18 @@ def smoothed(values: Single, deviation: float, error: float = math.inf) -> Singl
     """
     weights = _weights(deviation)
     library = native.library()
-    shape = (ctypes.c_int64 * 3)(*values.shape)
     layers, rows, _ = values.shape
     flat, out = np.empty_like(values), np.empty_like(values)
-    given = shape, weights.ctypes.data, len(weights) - 1
+    given = values.shape, pointer(weights), len(weights) - 1
 
     def layer(z: int) -> None:
         scratch = np.empty(values.shape[1:], dtype=np.float32)
         library.fhash_march_smooth_layers(
-            values.ctypes.data, *given, z, z + 1, flat.ctypes.data, scratch.ctypes.data
+            pointer(values), *given, z, z + 1, pointer(flat), pointer(scratch)
         )
 
     def row(y: int) -> None:
-        library.fhash_march_smooth_rows(flat.ctypes.data, *given, y, y + 1, out.ctypes.data)
+        library.fhash_march_smooth_rows(pointer(flat), *given, y, y + 1, pointer(out))
 
     def clip(z: int) -> None:
         out[z] -= values[z]
@@ -400,7 +391,7 @@ def _joined(intervals: list[Interval]) -> list[Interval]:
 
 
 def cells_of(
-    library: ctypes.CDLL, bricks: Bricks, task: Task, distance: npt.NDArray[np.int32]
+    library: native.Library, bricks: Bricks, task: Task, distance: npt.NDArray[np.int32]
 ) -> npt.NDArray[np.uint32] | None:
     """A bit for each cell of each brick, set where the cell is visible.
 
@@ -412,22 +403,13 @@ def cells_of(
     if len(limits) > MAX_LIMITS or not len(chosen):
         return None
     cells = np.zeros((*distance.shape, 2), dtype=np.uint32)
-    shape = (ctypes.c_int64 * 3)(*bricks.values.shape)
-    counts = (ctypes.c_int64 * 3)(*distance.shape)
 
     def look(numbers: Numbers, first: int, stop: int) -> int:
         """Set the bits of bricks by their numbers; how many bits are set."""
         return int(
             library.fhash_march_cells(
-                bricks.values.ctypes.data,
-                shape,
-                counts,
-                limits.ctypes.data,
-                len(limits),
-                numbers.ctypes.data,
-                first,
-                stop,
-                cells.ctypes.data,
+                *(pointer(bricks.values), bricks.values.shape, distance.shape),
+                *(pointer(limits), len(limits), pointer(numbers), first, stop, pointer(cells)),
             )
         )
 

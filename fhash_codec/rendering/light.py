@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from fhash_codec import native
+from fhash_codec.native import pointer
 from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
@@ -161,19 +161,10 @@ def factors_at_vertices(values: Single, grading: Grading, spacing: Double) -> Si
     library = native.library()
     table = np.append(grading.factors, grading.factors[-1]).astype(np.float32)
     out = np.empty(values.shape, dtype=np.float32)
-    shape = (ctypes.c_int64 * 3)(*values.shape)
 
     def layer(z: int) -> None:
-        library.fhash_march_factors(
-            values.ctypes.data,
-            shape,
-            scale.ctypes.data,
-            table.ctypes.data,
-            GRADES + 1,
-            z,
-            z + 1,
-            out.ctypes.data,
-        )
+        given = (pointer(values), values.shape, pointer(scale), pointer(table), GRADES + 1)
+        library.fhash_march_factors(*given, z, z + 1, pointer(out))
 
     list(in_threads(layer, range(len(values))))
     return out
@@ -346,12 +337,11 @@ def _sums(extinction: Single, step: Double, count: int) -> Single:
     """Sums of the extinction in the middle of `count` steps from each point."""
     library = native.library()
     sums = np.zeros(extinction.shape, dtype=np.float32)
-    shape, along = (ctypes.c_int64 * 3)(*extinction.shape), (ctypes.c_double * 3)(*step)
+    along = step.tolist()
 
     def layer(z: int) -> None:
-        library.fhash_march_sum(
-            extinction.ctypes.data, shape, along, count, z, z + 1, sums.ctypes.data
-        )
+        given = (pointer(extinction), extinction.shape, along, count)
+        library.fhash_march_sum(*given, z, z + 1, pointer(sums))
 
     list(in_threads(layer, range(len(extinction))))
     return sums
@@ -377,24 +367,13 @@ def _extinction(values: Single, table: Table, across: int, factors: Single | Non
     last = len(table.extinctions) - 1
     out = np.empty(points, dtype=np.float32)
     entries = np.append(table.extinctions, table.extinctions[-1]).astype(np.float32)
-    shape, sizes = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*points)
 
     def layer(z: int) -> None:
         scratch = np.empty(values.shape[2], dtype=np.float32)
         library.fhash_march_extinction(
-            values.ctypes.data,
-            shape,
-            entries.ctypes.data,
-            last + 1,
-            table.low,
-            last / (table.high - table.low),
-            across,
-            sizes,
-            z,
-            z + 1,
-            None if factors is None else factors.ctypes.data,
-            out.ctypes.data,
-            scratch.ctypes.data,
+            *(pointer(values), values.shape, pointer(entries), last + 1),
+            *(table.low, last / (table.high - table.low), across, points, z, z + 1),
+            *map(pointer, (factors, out, scratch)),
         )
 
     list(in_threads(layer, range(points[0])))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import math
-from ctypes import POINTER, c_double, c_float, c_int32, c_int64, c_uint32, c_void_p
 from dataclasses import dataclass
 from itertools import count, product
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_codec.native import ffi, pointer
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, reach_of, smoothed
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
@@ -28,17 +27,15 @@ from fhash_codec.rendering.march_task import (
     complete,
     extinctions_in,
 )
-from fhash_codec.rendering.tiled_frame import FETCH, Fetching, TiledFrame
+from fhash_codec.rendering.tiled_frame import Fetching, TiledFrame
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads, usable_threads
 from fhash_formats.support.values import Single
 
-MAX_SURFACES = 64
-"""Surfaces of a picture, at most: FHASH_SURFACES."""
-MAX_PLANES = 6
-"""Planes that clip a picture, at most: FHASH_PLANES."""
-POWERS = 1024
-"""Intervals of the table of highlights: FHASH_POWERS."""
+MAX_SURFACES: int = ffi.integer_const("FHASH_SURFACES")
+"""Surfaces of a picture, at most."""
+POWERS: int = ffi.integer_const("FHASH_POWERS")
+"""Intervals of the table of highlights."""
 TILE = 16
 """Pixels along a tile's side: TILE of march_packet.hpp."""
 SHADED = 1
@@ -57,97 +54,18 @@ ATTENUATED = 128
 GRADED = 256
 """Flag of `fhash_march`, with SHADED: the gradients decide on the opacity, too."""
 
-_Three = c_double * 3
-_Box = c_double * 2 * 3
 
+def structure_of(fields: dict[str, Any]) -> Any:
+    """`FhashMarch` (codec.h) of fields by name: numbers, arrays, and None for null.
 
-class March(ctypes.Structure):
-    """`FhashMarch` of march.hpp, field by field.
-
-    Pointers are given as contiguous arrays, or None for null. The structure keeps them alive.
-    Arrays for fields that lie within the structure are copied; their lengths may be smaller.
+    Whoever keeps it keeps the arrays of pointers. Arrays within the structure may be shorter.
     """
-
-    _fields_ = (
-        ("values", POINTER(c_float)),
-        ("shape", c_int64 * 3),
-        ("distance", POINTER(c_int32)),
-        ("cells", POINTER(c_uint32)),
-        ("highest", POINTER(c_float)),
-        ("bricks", c_int64 * 3),
-        ("table", POINTER(c_float)),
-        ("extinction", POINTER(c_double)),
-        ("entries", c_int64),
-        ("low", c_double),
-        ("scale", c_double),
-        ("light", POINTER(c_float)),
-        ("light_shape", c_int64 * 3),
-        ("light_offset", _Three),
-        ("light_scale", c_double),
-        ("eye", _Three),
-        ("right", _Three),
-        ("up", _Three),
-        ("forward", _Three),
-        ("box", _Box),
-        ("seen", _Box),
-        ("spacing", _Three),
-        ("width", c_int64),
-        ("height", c_int64),
-        ("parallel", c_int64),
-        ("rays", c_int64),
-        ("step", c_double),
-        ("threshold", c_double),
-        ("jitter", c_int64),
-        ("lamp", _Three),
-        ("ambient", c_double),
-        ("diffuse", c_double),
-        ("specular", c_double),
-        ("steep", c_double),
-        ("gradient", _Three),
-        ("floor", c_double),
-        ("powers", POINTER(c_float)),
-        ("surfaces", c_int64),
-        ("surface", c_double * 5 * MAX_SURFACES),
-        ("out", POINTER(c_float)),
-        ("depth", POINTER(c_float)),
-        ("normal", POINTER(c_float)),
-        ("central", c_int64),
-        ("path", c_int64),
-        ("planes", c_int64),
-        ("plane", c_double * 4 * MAX_PLANES),
-        ("grading", POINTER(c_float)),
-        ("grade_scale", c_double),
-        ("unlit", c_int64),
-        ("smooth", POINTER(c_float)),
-        ("network", c_void_p),
-        ("network_sizes", POINTER(c_int64)),
-        ("network_levels", POINTER(c_int64)),
-        ("network_layers", POINTER(c_int64)),
-        ("network_path", c_int64),
-        ("network_whole", c_int64),
-        ("network_low", c_double),
-        ("network_span", c_double),
-        ("network_status", POINTER(c_int64)),
-        ("ready", POINTER(c_int32)),
-        ("fetch", FETCH),
-    )
-
-    def __init__(self, **fields: Any) -> None:
-        arrays = {name: field for name, field in fields.items() if isinstance(field, np.ndarray)}
-        kinds: dict[str, Any] = dict(self._fields_)
-        for name, array in arrays.items():
-            if issubclass(kinds[name], ctypes.Array):
-                fields[name] = kinds[name]()
-                np.ctypeslib.as_array(fields[name])[: len(array)] = array
-                continue
-            assert array.flags.c_contiguous, f"{name} is not contiguous"
-            assert np.ctypeslib.as_ctypes_type(array.dtype) is kinds[name]._type_, (
-                f"{name} is {array.dtype}"
-            )
-            fields[name] = array.ctypes.data_as(kinds[name])
-        # A pointer in a structure does not refer to its array.
-        self._arrays = tuple(arrays.values())
-        super().__init__(**fields)
+    kinds = {name: field.type.kind for name, field in ffi.typeof("FhashMarch").fields}
+    given = {name: field for name, field in fields.items() if field is not None}
+    for name, field in given.items():
+        if isinstance(field, np.ndarray):
+            given[name] = field.tolist() if kinds[name] == "array" else pointer(field)
+    return ffi.new("FhashMarch *", given)
 
 
 MAX_MAGNITUDE = 1e36
@@ -163,9 +81,9 @@ class MarchInput:
     All places and directions are in vertices of the frame, x, y, z.
 
     Attributes:
-        fields: of `March`, by name: values, scaled where float32 could not compute with them, rays,
-            the drawn box as it is clipped, the part `seen` of it in which the frame has values, and
-            what follows from these.
+        fields: of `FhashMarch`, by name: values, scaled where float32 could not compute with them,
+            rays, the drawn box as it is clipped, the part `seen` of it in which the frame has
+            values, and what follows from these.
         low, high: values of the table's ends, scaled likewise.
         steepness: a gradient of shading of 1, in marched units per unit of the coordinates.
         smoothing: deviation of the Gaussian by which values are smoothed before shading, in
@@ -314,7 +232,7 @@ COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks", "evaluati
 
 
 def march_native(
-    library: ctypes.CDLL,
+    library: native.Library,
     frame: Frame | TiledFrame,
     task: Task,
     bricks: Bricks,
@@ -347,7 +265,7 @@ def march_native(
     # Normals need the depth, to keep that of the nearest of several rays.
     depth = np.full((height, width), np.inf, np.float32) if task.depth or task.normal else None
     normal = np.zeros((height, width, 3), dtype=np.float32) if task.normal else None
-    structure = March(
+    everything = dict(
         **given.fields,
         **fields,
         **_table_fields(given, task),
@@ -365,7 +283,7 @@ def march_native(
         normal=normal,
         path=path,
     )
-    counters = _march(library, structure, task, threads, progress)
+    counters = _march(library, structure_of(everything), task, threads, progress)
     if fetching is not None and fetching.error is not None:
         raise fetching.error
     if frame.network is not None and given.fields["network_status"].any():
@@ -374,7 +292,7 @@ def march_native(
 
 
 def _skipping_fields(
-    library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Bricks
+    library: native.Library, given: MarchInput, task: Task, bricks: Bricks
 ) -> dict[str, Any]:
     """The fields of the bricks and cells that rays may pass over; none where all is looked at.
 
@@ -492,8 +410,8 @@ def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
 
 
 def _march(
-    library: ctypes.CDLL,
-    structure: March,
+    library: native.Library,
+    structure: Any,
     task: Task,
     threads: int | None,
     progress: Progress,
@@ -513,9 +431,7 @@ def _march(
             if thread == 0:
                 progress("marching", group, len(spans), "")
             first, stop = spans[group]
-            failed = library.fhash_march(
-                ctypes.byref(structure), flags, first, stop, counters.ctypes.data
-            )
+            failed = library.fhash_march(structure, flags, first, stop, pointer(counters))
             assert not failed
         return counters
 

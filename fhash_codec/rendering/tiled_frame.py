@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections import defaultdict
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
+from fhash_codec.native import ffi
 from fhash_codec.rendering.bricks import (
     CORNERS,
     FARTHEST,
@@ -48,8 +48,6 @@ way through them."""
 
 Spans = list[tuple[int, int]]
 """First and end along z, y and x."""
-FETCH = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)
-"""`FhashFetch` of march.hpp."""
 
 
 class TiledFrame:
@@ -257,7 +255,7 @@ class Fetching:
     matter to every ray.
 
     Attributes:
-        fields: of `March`, by name.
+        fields: of `FhashMarch`, by name.
         error: what a block failed by, None if none did.
     """
 
@@ -287,8 +285,9 @@ class Fetching:
         )
         self._ready = np.zeros(shape, np.int32)
         self.error: BaseException | None = None
-        # Callbacks of ctypes live as long as their object.
-        self.fields: dict[str, Any] = {"ready": self._ready, "fetch": FETCH(self._fetch)}
+        # Callbacks live as long as their object.
+        fetch = ffi.callback("FhashFetch", self._fetch, error=1)
+        self.fields: dict[str, Any] = {"ready": self._ready, "fetch": fetch}
         if by == "distance":
             self.fields["distance"] = np.zeros(shape, np.int32)
         elif by == "highest":

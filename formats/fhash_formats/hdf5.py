@@ -7,7 +7,6 @@ other programs `fhash hdf5-plugin-path` prints it. The documentation shows the t
 
 from __future__ import annotations
 
-import ctypes
 import os
 import struct
 from collections.abc import Sequence
@@ -88,9 +87,8 @@ def _halves(number: float) -> tuple[int, ...]:
 
 
 def _register() -> None:
-    find = native.library().H5PLget_plugin_info
-    find.restype, find.argtypes = ctypes.c_void_p, ()
-    h5py.h5z.register_filter(find())
+    address = native.ffi.cast("intptr_t", native.library().H5PLget_plugin_info())
+    h5py.h5z.register_filter(int(address))
     known = os.environ.get("HDF5_PLUGIN_PATH", _DEFAULT_PATH)
     if str(native.FOLDER) not in known.split(os.pathsep):
         os.environ["HDF5_PLUGIN_PATH"] = os.pathsep.join((known, str(native.FOLDER)))

@@ -14,6 +14,7 @@ class PyFhash(PythonPackage):
     depends_on("py-setuptools@77:", type="build")
     with default_args(type=("build", "run")):
         depends_on("py-numpy@2.0:")
+        depends_on("py-cffi@1.17:")
         depends_on("py-zarr@3.1.3:")
         depends_on("py-numcodecs@0.16:")
         depends_on("py-h5py@3.12:")

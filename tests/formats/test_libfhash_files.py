@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import threading
@@ -23,6 +22,7 @@ from fhash_codec import DamagedFileError, EncodeConfig, Volume, encoding
 from fhash_codec.compact import encode as compact
 from fhash_formats import native
 from fhash_formats.container import Container
+from fhash_formats.native import ffi, pointer
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.head import Layer, NeighbourHead
 
@@ -33,65 +33,20 @@ ARGUMENT, MEMORY, DAMAGED, READ = -1, -2, -3, -5
 UNLIMITED = 0
 
 Region = Sequence[tuple[int, int]]
-Reader = ctypes.CFUNCTYPE(
-    ctypes.c_int32, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint64, ctypes.c_void_p
-)
-_P, _I, _D = ctypes.c_void_p, ctypes.c_int32, ctypes.c_double
-
-
-class Failure(ctypes.Structure):
-    """The `fhash_error` of fhash.h."""
-
-    _fields_ = (("status", _I), ("text", ctypes.c_char * 500))
-
-
-class Facts(ctypes.Structure):
-    """The `fhash_variable` of fhash.h."""
-
-    _fields_ = (
-        ("size", ctypes.c_size_t),
-        *((name, ctypes.c_char_p) for name in ("name", "units", "attributes")),
-        *((name, _I) for name in ("type", "levels")),
-        ("shape", ctypes.c_int64 * 4),
-        ("tile", ctypes.c_int64 * 4),
-        ("box", ctypes.c_int64 * 6),
-        *((name, _D) for name in ("low", "high", "background", "max_error", "psnr")),
-    )
+LIBRARY, NULL = native.library(), ffi.NULL
 
 
 class Refused(Exception):
     """A status other than FHASH_OK: its number and its text."""
 
 
-def library() -> ctypes.CDLL:
-    loaded = ctypes.CDLL(native.library()._name)
-    for name, result, arguments in (
-        ("context_create", _P, (ctypes.c_uint64, _I)),
-        ("context_destroy", None, (_P,)),
-        ("open", _I, (_P, Reader, _P, ctypes.c_uint64, _P, _P)),
-        ("open_path", _I, (_P, ctypes.c_char_p, _P, _P)),
-        ("close", None, (_P,)),
-        ("header", ctypes.c_char_p, (_P,)),
-        ("variables", _I, (_P,)),
-        ("variable_get", _I, (_P, _I, _P, _P)),
-        ("coordinate", _I, (_P, _I, _I, _P, _P, _P)),
-        ("read", _I, (_P, _I, _D, _P, _I, _I, _P, _P)),
-    ):
-        function = getattr(loaded, f"fhash_{name}")
-        function.restype, function.argtypes = result, arguments
-    return loaded
-
-
-LIBRARY = library()
-
-
 def call(function: Callable[..., int], *arguments: Any) -> None:
-    failure = Failure()
-    status = function(*arguments, ctypes.byref(failure))
+    failure = ffi.new("fhash_error *")
+    status = function(*arguments, failure)
     if status:
         assert failure.status == status
-        assert failure.text
-        raise Refused(status, failure.text.decode())
+        assert failure.text[0] != b"\0"
+        raise Refused(status, ffi.string(failure.text).decode())
 
 
 class Opened:
@@ -101,28 +56,30 @@ class Opened:
         self, source: Path | bytes, *, memory: int = UNLIMITED, fails_at: int = -1, threads: int = 1
     ) -> None:
         self.reads: list[tuple[int, int]] = []
-        self._context = _P(LIBRARY.fhash_context_create(memory, threads))
-        self._file = _P()
+        self._context = LIBRARY.fhash_context_create(memory, threads)
+        opened = ffi.new("fhash_file **")
 
-        def read(_: Any, offset: int, length: int, place: int) -> int:
+        def read(_: Any, offset: int, length: int, place: Any) -> int:
             self.reads.append((offset, length))
             assert isinstance(source, bytes)
             assert offset + length <= len(source), "a read beyond the end"
-            ctypes.memmove(place, source[offset : offset + length], length)
+            ffi.memmove(place, source[offset : offset + length], length)
             return int(len(self.reads) - 1 == fails_at)
 
-        self._read = Reader(read)  # which must live as long as the file
+        # It must live as long as the file.
+        self._read = ffi.callback("fhash_read_function", read)
         try:
             if isinstance(source, bytes):
-                place = (self._read, None, len(source))
-                call(LIBRARY.fhash_open, self._context, *place, ctypes.byref(self._file))
+                place = (self._read, NULL, len(source))
+                call(LIBRARY.fhash_open, self._context, *place, opened)
             else:
                 path = os.fsencode(source)
-                call(LIBRARY.fhash_open_path, self._context, path, ctypes.byref(self._file))
+                call(LIBRARY.fhash_open_path, self._context, path, opened)
         except Refused:
-            assert not self._file.value
+            assert not opened[0]
             LIBRARY.fhash_context_destroy(self._context)
             raise
+        self._file = opened[0]
 
     def __enter__(self) -> Opened:
         return self
@@ -133,20 +90,20 @@ class Opened:
 
     @property
     def header(self) -> Any:
-        return json.loads(LIBRARY.fhash_header(self._file))
+        return json.loads(ffi.string(LIBRARY.fhash_header(self._file)))
 
-    def facts(self) -> list[Facts]:
-        found = [Facts(ctypes.sizeof(Facts)) for _ in range(LIBRARY.fhash_variables(self._file))]
+    def facts(self) -> list[Any]:
+        size, count = ffi.sizeof("fhash_variable"), LIBRARY.fhash_variables(self._file)
+        found = [ffi.new("fhash_variable *", {"size": size}) for _ in range(count)]
         for number, each in enumerate(found):
-            call(LIBRARY.fhash_variable_get, self._file, number, ctypes.byref(each))
+            call(LIBRARY.fhash_variable_get, self._file, number, each)
         return found
 
     def coordinate(self, number: int, axis: int, length: int) -> tuple[npt.NDArray[Any], Any]:
-        positions, attributes = np.empty(length), ctypes.c_char_p()
-        places = (positions.ctypes.data, ctypes.byref(attributes))
+        positions, attributes = np.empty(length), ffi.new("char **")
+        places = (pointer(positions), attributes)
         call(LIBRARY.fhash_coordinate, self._file, number, axis, *places)
-        assert attributes.value is not None
-        return positions, json.loads(attributes.value)
+        return positions, json.loads(ffi.string(attributes[0]))
 
     def read(
         self,
@@ -162,9 +119,9 @@ class Opened:
         every = 1 << lod
         values = np.full([-(-b // every) - -(-a // every) for a, b in region], 77, dtype)
         whole = all(not isinstance(n, tuple) for n in shape)
-        ends = None if whole else (ctypes.c_int64 * 6)(*(end for span in region for end in span))
+        ends = NULL if whole else [end for span in region for end in span]
         kind = TYPES.index(dtype) + 1
-        call(LIBRARY.fhash_read, self._file, number, step, ends, lod, kind, values.ctypes.data)
+        call(LIBRARY.fhash_read, self._file, number, step, ends, lod, kind, pointer(values))
         return values
 
 
@@ -234,9 +191,9 @@ def test_headers_and_positions_are_those_of_python(name: str) -> None:
         headers = file.header["variables"]
         assert len(headers) == len(file.facts()) == len(container.names)
         for number, (volume, facts) in enumerate(zip(volumes(path), file.facts(), strict=True)):
-            assert facts.name.decode() == container.names[number]
-            assert facts.units.decode() == volume.units
-            assert json.loads(facts.attributes) == volume.attrs
+            assert ffi.string(facts.name).decode() == container.names[number]
+            assert ffi.string(facts.units).decode() == volume.units
+            assert json.loads(ffi.string(facts.attributes)) == volume.attrs
             assert tuple(facts.shape) == volume.shape
             assert TYPES[facts.type - 1] == volume.source_dtype.name
             assert tuple(facts.box) == tuple(end for span in volume.box for end in span)

@@ -1,16 +1,15 @@
-"""Passes of the native library over each value, by ctypes, for tests that look at one alone."""
+"""Passes of the native library over each value, by cffi, for tests that look at one alone."""
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.native import library, pointer
 from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.values import cast, pieces
-from reference.kernels import library
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""
@@ -40,11 +39,11 @@ def quantise(
     scaled = np.empty(coefficients.shape, np.float32)
     source = np.ascontiguousarray(coefficients)
     getattr(library(), f"fhash_quantise_f{width}")(
-        ctypes.c_void_p(source.ctypes.data),
-        ctypes.c_int64(source.size),
-        *(ctypes.c_double(number) for number in (scale, ROUNDING, LARGEST)),
-        ctypes.c_void_p(integers.ctypes.data),
-        ctypes.c_void_p(scaled.ctypes.data),
+        pointer(source),
+        source.size,
+        *(scale, ROUNDING, LARGEST),
+        pointer(integers),
+        pointer(scaled),
     )
     return integers, scaled
 
@@ -68,11 +67,11 @@ def dequantise(
     shifts = np.array(offsets, dtype=np.float64) / OFFSET_UNIT
     result, source = np.empty(integers.shape, kind), np.ascontiguousarray(integers)
     getattr(library(), f"fhash_dequantise_f{kind.itemsize * 8}")(
-        ctypes.c_void_p(source.ctypes.data),
-        ctypes.c_int64(source.size),
-        ctypes.c_double(step),
-        ctypes.c_void_p(shifts.ctypes.data),
-        ctypes.c_void_p(result.ctypes.data),
+        pointer(source),
+        source.size,
+        step,
+        pointer(shifts),
+        pointer(result),
     )
     return result
 
@@ -99,8 +98,8 @@ def within(values: Values, decoded: Values, error: float, counted: Mask | None =
     return bool(
         _native("within", values.dtype)(
             *_pointers(values, decoded, counted),
-            ctypes.c_int64(values.size),
-            ctypes.c_double(error),
+            values.size,
+            error,
         )
     )
 
@@ -143,9 +142,9 @@ def residual_of(
     nonzero = int(
         _native("residual", values.dtype, base.dtype)(
             *_pointers(values, base, counted),
-            ctypes.c_int64(values.size),
-            ctypes.c_double(quantum),
-            ctypes.c_double(largest),
+            values.size,
+            quantum,
+            largest,
             *_pointers(residual),
         )
     )
@@ -171,8 +170,8 @@ def corrected(
     result = np.empty(base.shape, kind)
     _native("correct", base.dtype, kind)(
         *_pointers(base, residual),
-        ctypes.c_int64(base.size),
-        ctypes.c_double(quantum),
+        base.size,
+        quantum,
         *_pointers(result),
     )
     return result if kind == dtype else cast(result, dtype)
@@ -186,8 +185,8 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
     assert values.flags.c_contiguous, "they are changed in place"
     _native("clip", values.dtype)(
         *_pointers(values),
-        ctypes.c_int64(values.size),
-        *(ctypes.c_double(number) for number in (center, low, high)),
+        values.size,
+        *(center, low, high),
     )
     return values
 
@@ -234,9 +233,9 @@ def free_values(
     return int(
         _native("free", target.dtype)(
             *_pointers(target, rebuilt, counted),
-            ctypes.c_int64(target.size),
-            ctypes.c_double(low),
-            ctypes.c_double(high),
+            target.size,
+            low,
+            high,
         )
     )
 
@@ -247,11 +246,6 @@ def _native(name: str, *types: np.dtype[Any]) -> Any:
     return getattr(library(), "_".join(["fhash", name, *ends]))
 
 
-def _pointers(*arrays: Values | None) -> list[ctypes.c_void_p]:
-    """Pointers to C-ordered arrays; each keeps its array, or the C-ordered copy of it, alive."""
-    return [
-        ctypes.c_void_p(None)
-        if array is None
-        else np.ascontiguousarray(array).ctypes.data_as(ctypes.c_void_p)
-        for array in arrays
-    ]
+def _pointers(*arrays: Values | None) -> list[Any]:
+    """Pointers to C-ordered arrays, or to the C-ordered copies of them."""
+    return [pointer(None if array is None else np.ascontiguousarray(array)) for array in arrays]

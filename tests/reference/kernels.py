@@ -1,8 +1,7 @@
-"""Entropy coders of the native library by ctypes, for tests that look at one kernel alone."""
+"""Entropy coders of the native library by cffi, for tests that look at one kernel alone."""
 
 from __future__ import annotations
 
-import ctypes
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,90 +14,10 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.native import ffi, library, pointer
 from fhash_formats.support.values import Integers, Mask
 from fhash_formats.transform.predict import CLASSES, Predictor, Tap
 from fhash_formats.transform.spec import MaskLevels, checked
-
-ARRAY, INTEGER, REAL = native.ARRAY, native.INTEGER, native.REAL
-_SIZED = (ARRAY, INTEGER)
-_STATE = _SIZED * 3
-"""Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
-_TRANSFORM = (*(ARRAY,) * 9, INTEGER)
-_RECONSTRUCT = (*_TRANSFORM, ARRAY)
-_QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
-_DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
-_WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
-_CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
-_FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
-_RESIDUAL = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, ARRAY)
-_CORRECT = (ARRAY, ARRAY, INTEGER, REAL, ARRAY)
-_MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
-_TYPES = ("f32", "f64")
-_PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
-
-PROTOTYPES: native.Prototypes = {
-    # coder.cpp
-    "fhash_encode": (
-        ARRAY,
-        ARRAY,
-        REAL,
-        INTEGER,
-        ARRAY,
-        *_SIZED,
-        *_STATE,
-        INTEGER,
-        *_SIZED,
-    ),
-    "fhash_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
-    # fast.cpp
-    "fhash_fast_encode": (
-        ARRAY,
-        ARRAY,
-        INTEGER,
-        REAL,
-        REAL,
-        ARRAY,
-        *_SIZED,
-        ARRAY,
-        ARRAY,
-        *_SIZED,
-        ARRAY,
-    ),
-    "fhash_fast_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, ARRAY, ARRAY, *_SIZED),
-    # mask.cpp
-    "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
-    "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
-    # mask_levels.cpp
-    **{f"fhash_mask_levels_{kind}": _MASK_LEVELS for kind in _TYPES},
-    # labels.cpp
-    "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
-    "fhash_decode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
-    # predict.cpp
-    "fhash_encode_predicted": (*(ARRAY,) * 4, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
-    "fhash_decode_predicted": (*(ARRAY,) * 3, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
-    # lifting.cpp
-    **{f"fhash_transform_forward_{kind}": _TRANSFORM for kind in _TYPES},
-    **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
-    **{f"fhash_reconstruct_{kind}": _RECONSTRUCT for kind in _TYPES},
-    # quantise.cpp
-    **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
-    **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
-    # values.cpp
-    **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
-    **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},
-    **{f"fhash_free_{kind}": _FREE for kind in _TYPES},
-    **{f"fhash_residual_{pair}": _RESIDUAL for pair in _PAIRS},
-    **{f"fhash_correct_{pair}": _CORRECT for pair in _PAIRS},
-}
-"""Kernels that only tests call from Python."""
-
-
-def library() -> ctypes.CDLL:
-    """The native library, with the kernels of PROTOTYPES."""
-    # Another name of the folder: under its own one the library is loaded for the product.
-    folder = Path(native.__file__).parent / ".." / "native"
-    return native.load_library(folder, "libfhash", native.ABI_VERSION, PROTOTYPES)
-
 
 Buffer = npt.NDArray[np.uint8]
 """Room for the bytes of an encoder."""
@@ -332,11 +251,11 @@ def encode_integers(
         if chosen is not None:
             np.copyto(integers, given)
         code: int = library().fhash_encode(
-            _pointer(integers),
-            _pointer(chosen),
+            pointer(integers),
+            pointer(chosen),
             weight,
             trellis,
-            (ctypes.c_int64 * 4)(*integers.shape),
+            integers.shape,
             *array_arguments(table),
             *state_arguments(prior_state(trellis)),
             False,  # the state is not kept
@@ -396,20 +315,20 @@ def decode_integers(
     """
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
-    where = ((ctypes.c_int64 * 4)(*shape), *array_arguments(table))
+    where = (shape, *array_arguments(table))
     if fast:
         prior = fast_prior()
         code = library().fhash_fast_decode(
-            _pointer(integers),
+            pointer(integers),
             trellis,
             *where,
-            _pointer(prior.defaults),
-            _pointer(prior.lookup),
+            pointer(prior.defaults),
+            pointer(prior.lookup),
             *array_arguments(source),
         )
     else:
         code = library().fhash_decode(
-            _pointer(integers),
+            pointer(integers),
             trellis,
             *where,
             *state_arguments(prior_state(trellis)),
@@ -507,30 +426,24 @@ def _fast(
 
     how: whether integers are chosen on a trellis, factor of the values, weight of a bit.
     """
-    prior, results = fast_prior(), (ctypes.c_double * 2)()
+    prior, results = fast_prior(), ffi.new("double[2]")
     size = library().fhash_fast_encode(
-        _pointer(integers),
-        _pointer(values),
+        pointer(integers),
+        pointer(values),
         *how,
-        (ctypes.c_int64 * 4)(*shape),
+        shape,
         *array_arguments(table),
-        _pointer(prior.slots),
-        _pointer(prior.defaults),
+        pointer(prior.slots),
+        pointer(prior.defaults),
         *array_arguments(buffer),
         results,
     )
     return checked(size), results[0], results[1]
 
 
-def _pointer(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
-    # The pointer object also keeps the array alive. When threads build the prior at the same time,
-    # only one of their copies is cached, and nothing else refers to the others.
-    return ctypes.c_void_p(None) if array is None else array.ctypes.data_as(ctypes.c_void_p)
-
-
-def array_arguments(array: npt.NDArray[Any]) -> tuple[ctypes.c_void_p, int]:
+def array_arguments(array: npt.NDArray[Any]) -> tuple[Any, int]:
     """An array and its length along the first axis, as the native functions take them."""
-    return _pointer(array), len(array)
+    return pointer(array), len(array)
 
 
 def state_arguments(state: State) -> list[Any]:
@@ -549,11 +462,11 @@ def encode_labels(labels: npt.NDArray[Any], count: int) -> bytes:
     """Code labels (t, z, y, x), each below `count`, of which there are 1 to MAX_LABELS."""
     # The coder writes to its labels, also in encoding, but does not change them.
     work = np.array(labels, dtype=np.uint16, order="C")
-    shape = (ctypes.c_int64 * 4)(*work.shape)
+    shape = work.shape
 
     def encode(buffer: Buffer) -> int:
         code: int = library().fhash_encode_labels(
-            work.ctypes.data, count, shape, *array_arguments(buffer)
+            pointer(work), count, shape, *array_arguments(buffer)
         )
         return code
 
@@ -567,9 +480,7 @@ def decode_labels(data: bytes | memoryview, count: int, shape: tuple[int, ...]) 
     """
     labels = np.zeros(shape, dtype=np.uint16)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = library().fhash_decode_labels(
-        labels.ctypes.data, count, (ctypes.c_int64 * 4)(*shape), *array_arguments(source)
-    )
+    code = library().fhash_decode_labels(pointer(labels), count, shape, *array_arguments(source))
     checked(code)
     return labels
 
@@ -588,18 +499,18 @@ def mask_levels(mask: MaskLevels, values: npt.NDArray[Any]) -> tuple[Levels, Lev
     with np.errstate(over="ignore"):
         edges = np.array(mask.edges, dtype=values.dtype)
     source = np.ascontiguousarray(values)
-    scores = (ctypes.c_int32 * len(mask.scores))(*mask.scores)
-    others = (ctypes.c_int32 * len(mask.others))(*mask.others) if mask.others else None
+    scores = mask.scores
+    others = mask.others or ffi.NULL
     function = getattr(library(), f"fhash_mask_levels_f{8 * values.dtype.itemsize}")
     code = function(
-        source.ctypes.data,
-        (ctypes.c_int64 * 4)(*values.shape),
+        pointer(source),
+        values.shape,
         *array_arguments(edges),
         scores,
         others,
         mask.reach,
-        first.ctypes.data,
-        second.ctypes.data,
+        pointer(first),
+        pointer(second),
     )
     checked(code)
     return first, second
@@ -646,8 +557,8 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels]) -> bytes:
 
     def encode(buffer: Buffer) -> int:
         code: int = library().fhash_encode_mask(
-            *(array.ctypes.data for array in (bits, first, second)),
-            (ctypes.c_int64 * 4)(*mask.shape),
+            *map(pointer, (bits, first, second)),
+            mask.shape,
             *state_arguments(mask_prior_state()),
             False,  # the state is not kept
             *array_arguments(buffer),
@@ -667,8 +578,8 @@ def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask
     first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in levels)
     source = np.frombuffer(data, dtype=np.uint8)
     code = library().fhash_decode_mask(
-        *(array.ctypes.data for array in (mask, first, second)),
-        (ctypes.c_int64 * 4)(*shape),
+        *map(pointer, (mask, first, second)),
+        shape,
         *state_arguments(mask_prior_state()),
         *array_arguments(source),
     )
@@ -727,8 +638,8 @@ def encode_predicted(
     def encode(buffer: Buffer) -> int:
         np.copyto(result, integers)
         code: int = library().fhash_encode_predicted(
-            result.ctypes.data,
-            None if marks is None else marks.ctypes.data,
+            pointer(result),
+            pointer(marks),
             *_geometry(integers.shape, predictor),
             *state_arguments(blank_predicted_state()),
             *array_arguments(buffer),
@@ -748,7 +659,7 @@ def decode_predicted(
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
     code = library().fhash_decode_predicted(
-        integers.ctypes.data,
+        pointer(integers),
         *_geometry(shape, predictor),
         *state_arguments(blank_predicted_state()),
         *array_arguments(source),
@@ -759,18 +670,14 @@ def decode_predicted(
 
 
 def _geometry(shape: tuple[int, ...], predictor: Predictor) -> list[Any]:
-    """Shape, levels, passes, taps and weights as the native functions take them.
-
-    The pointers keep their arrays alive.
-    """
+    """Shape, levels, passes, taps and weights as the native functions take them."""
     passes, taps, weights = pass_arrays(predictor)
-    four = ctypes.c_int64 * 4
     return [
-        four(*shape),
-        four(*predictor.levels),
+        shape,
+        predictor.levels,
         *array_arguments(passes),
-        taps.ctypes.data_as(ctypes.c_void_p),
-        weights.ctypes.data_as(ctypes.c_void_p),
+        pointer(taps),
+        pointer(weights),
     ]
 
 

@@ -1,8 +1,7 @@
-"""Transform of the native library by ctypes, for tests that look at one kernel alone."""
+"""Transform of the native library by cffi, for tests that look at one kernel alone."""
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +13,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from fhash_formats.errors import InputError
+from fhash_formats.native import ffi, library, pointer
 from fhash_formats.support.values import Integers, Values
 from fhash_formats.transform.spec import AXES, KINDS, AxisTransform, TransformSpec
-from reference.kernels import COLUMNS, NO_REFERENCE, Table, library
+from reference.kernels import COLUMNS, NO_REFERENCE, Table
 
 MAX_EXACT = 512
 """Longest axis, in vertices, whose norms are computed at each position."""
@@ -77,17 +77,16 @@ def _inverse(bands: NDArray[np.float64], kind: str, depth: int) -> NDArray[np.fl
     """The columns that the inverse of a wavelet makes of columns of bands."""
     n, columns = bands.shape
     values, ones = np.empty_like(bands), np.ones(max(n, columns))
-    four, pointer = ctypes.c_int64 * 4, ctypes.c_void_p
     code = library().fhash_transform_inverse_f64(
-        pointer(bands.ctypes.data),
-        pointer(values.ctypes.data),
-        four(n, 1, 1, columns),
-        four(KINDS.index(kind), 0, 0, 0),
-        four(depth, 0, 0, 0),
-        four(0, 0, 0, 0),
-        (pointer * 4)(None, None, None, None),
-        pointer(ones.ctypes.data),
-        pointer(ones.ctypes.data),
+        pointer(bands),
+        pointer(values),
+        (n, 1, 1, columns),
+        (KINDS.index(kind), 0, 0, 0),
+        (depth, 0, 0, 0),
+        (0, 0, 0, 0),
+        [ffi.NULL] * 4,
+        pointer(ones),
+        pointer(ones),
         1,
     )
     if code != 0:
@@ -152,7 +151,7 @@ class _Plan:
         _check_code(
             getattr(library(), f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
                 *self._native_arguments(integers, result, inverse=True),
-                (ctypes.c_double * len(numbers))(*numbers),
+                numbers,
             )
         )
 
@@ -170,19 +169,18 @@ class _Plan:
         """The arguments of the native transforms."""
         rank_axis = 1 if inverse else 0
         ranks = [0 if matrix is None else matrix.shape[rank_axis] for matrix in self.matrices]
-        four = ctypes.c_int64 * 4
         matrices = self._native_matrices
-        pointers = (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in matrices))
+        pointers = [pointer(matrix) for matrix in matrices]
         return [
-            source.ctypes.data_as(ctypes.c_void_p),
-            result.ctypes.data_as(ctypes.c_void_p),
-            four(*source.shape),
-            four(*(KINDS.index(kind) for kind in self.kinds)),
-            four(*self.depths),
-            four(*ranks),
+            pointer(source),
+            pointer(result),
+            source.shape,
+            [KINDS.index(kind) for kind in self.kinds],
+            self.depths,
+            ranks,
             pointers,
-            self.scale_tz.ctypes.data_as(ctypes.c_void_p),
-            self.scale_yx.ctypes.data_as(ctypes.c_void_p),
+            pointer(self.scale_tz),
+            pointer(self.scale_yx),
             THREADS,
         ]
 

@@ -172,7 +172,8 @@ def test_speed_and_access_are_those_of_the_target_nearest_to_50_db(result: RateB
     for entry in result.access:
         assert entry.region == (6, 16, 16)
         assert entry.milliseconds > 0
-        assert 0 < entry.bytes_read <= entry.bytes
+        # Small files are read once, whole; the times in them have more digits or fewer.
+        assert 0 < entry.bytes_read <= entry.bytes + 64
 
 
 def test_small_chunks_are_measured_where_frames_are_larger(field: Field) -> None:

@@ -5,6 +5,7 @@
 // multiply-adds here, which makes the products faster by a quarter. No stream of bits depends on
 // these sources, so machines may differ in the last bits.
 #include "core.hpp"
+#include "network.h"
 
 // Raise it whenever an exported signature or its meaning changes; __init__.py holds the same
 // number.

@@ -1,5 +1,6 @@
 // The instruction paths of this machine, and what it can do at most on one of them: the arithmetic
 // of fused multiply-adds in registers, and copies of memory. Benchmarks hold kernels to these.
+#include "network.h"
 #include "vector.hpp"
 
 #if defined(FHASH_VECTORS)

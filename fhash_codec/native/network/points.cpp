@@ -1,4 +1,5 @@
 // The network at scattered points: the functions that Python and the marcher call.
+#include "network.h"
 #include "points.hpp"
 
 #include <vector>

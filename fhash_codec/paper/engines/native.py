@@ -14,7 +14,6 @@ threads and instructions of the processor give the same bits.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any
@@ -23,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.native.network import PATHS, library, machine_paths
+from fhash_codec.native.network import PATHS, ffi, library, machine_paths, pointer
 from fhash_codec.paper.engines.parameters import (
     BETA1,
     BETA2,
@@ -41,112 +40,25 @@ from fhash_formats.errors import InputError
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.support.values import Double, Longs, Single
 
-GROUP = 16
-"""Vertices along x that are interpolated together; FHASH_GROUP in bricks.hpp."""
-REACH = 32
-"""Corners that they need at most, rounded up to whole vectors; FHASH_REACH in bricks.hpp."""
-BLOCK = 32
-"""Numbers of the largest coarse table that Adam moves together; FHASH_BLOCK in bricks.hpp."""
-WIDEST = 128
-"""Neurons of a hidden layer at most; FHASH_WIDEST in bricks.hpp."""
+GROUP: int = ffi.integer_const("FHASH_GROUP")
+"""Vertices along x that are interpolated together."""
+REACH: int = ffi.integer_const("FHASH_REACH")
+"""Corners that they need at most, rounded up to whole vectors."""
+BLOCK: int = ffi.integer_const("FHASH_BLOCK")
+"""Numbers of the largest coarse table that Adam moves together."""
+WIDEST: int = ffi.integer_const("FHASH_WIDEST")
+"""Neurons of a hidden layer at most."""
 MOST_HIDDEN = 2
 """Hidden layers at most."""
 CATCH_UP, TRAIN, ADAM, INFER = range(4)
 """Parts of a step, and an evaluation, as train_bricks.cpp numbers them."""
-
-_POINTER = ctypes.c_void_p
-_INTEGER = ctypes.c_int64
-_REAL = ctypes.c_double
-
-
-# The structures mirror those of fhash_codec/native/network/bricks.hpp field by field. A structure
-# holds addresses alone: whoever fills it keeps the arrays.
-
-
-class Level(ctypes.Structure):
-    """`FhashLevel`: where a brick's sub-lattice lies in a coarse table, and its weights."""
-
-    _fields_ = (
-        ("corners", _INTEGER * 4),
-        ("stride", _INTEGER * 4),
-        ("start", _POINTER * 4),
-        ("time", _POINTER),
-        ("first", _POINTER * 2),
-        ("weight", _POINTER * 2),
-        ("reach", _POINTER),
-        ("spread", _POINTER),
-        ("gathered", _POINTER),
-    )
-
-
-class Gaps(ctypes.Structure):
-    """`FhashGaps`: the closed form of Adam's steps without a gradient."""
-
-    _fields_ = tuple(
-        (name, _POINTER)
-        for name in (
-            "weight",
-            "inverse",
-            "weight_sum",
-            "inverse_sum",
-            "factor",
-            "epsilon",
-            "mean_decay",
-            "square_decay",
-        )
-    )
-
-
-class Bricks(ctypes.Structure):
-    """`FhashBricks`: a model in training on a coreset."""
-
-    _fields_ = (
-        *((name, _INTEGER) for name in ("path", "embedding", "own", "levels", "hidden", "width")),
-        ("shape", _INTEGER * 3),
-        ("threads", _INTEGER),
-        ("bricks", _POINTER),
-        ("mask", _POINTER),
-        ("mask_bytes", _INTEGER),
-        ("values", _POINTER),
-        ("offsets", _POINTER),
-        ("samples", _INTEGER),
-        ("fine", _POINTER),
-        ("fine_mean", _POINTER),
-        ("fine_square", _POINTER),
-        ("visited", _POINTER),
-        ("flat", _POINTER),
-        ("flat_mean", _POINTER),
-        ("flat_square", _POINTER),
-        ("coarse", _INTEGER),
-        ("numbers", _INTEGER),
-        ("lazy", _INTEGER),
-        ("blocks", _POINTER),
-        ("rank", _POINTER),
-        ("level", ctypes.POINTER(Level)),
-        ("current", _POINTER),
-        ("gaps", Gaps),
-        ("step", _INTEGER),
-        ("rate", _REAL),
-        ("scale", _REAL),
-        ("chosen", _POINTER),
-        ("count", _INTEGER),
-        ("stamps", _POINTER),
-        ("touched", _POINTER),
-        ("touches", _INTEGER),
-        ("gradient", _POINTER),
-        ("work", _POINTER),
-        ("work_size", _INTEGER),
-        ("error", _POINTER),
-        ("out", _POINTER),
-        ("places", _POINTER),
-    )
 
 
 class LevelTables:
     """The tables of the coarse levels, and the structures that point to them.
 
     Attributes:
-        levels: one structure a level, an array of ctypes.
+        levels: one `FhashLevel` a level.
         arrays: everything that the structures point to.
     """
 
@@ -156,7 +68,7 @@ class LevelTables:
         coarse: the coarse levels (`coarse_axes`).
         """
         self.arrays: list[npt.NDArray[Any]] = []
-        self.levels = (Level * max(len(coarse), 1))()
+        self.levels = ffi.new("FhashLevel[]", max(len(coarse), 1))
         numbers, size = 0, architecture.embedding_size
         for level, axes, resolution in zip(
             self.levels, coarse, architecture.levels[-len(coarse) :], strict=False
@@ -167,7 +79,7 @@ class LevelTables:
 
     def _fill(
         self,
-        level: Level,
+        level: Any,
         axes: Sequence[tuple[Longs, Double]],
         stride: Sequence[int],
         numbers: int,
@@ -177,23 +89,23 @@ class LevelTables:
         for axis, (start, weight) in enumerate(axes):
             weights.append(weight)
             level.corners[axis], level.stride[axis] = weight.shape[2], stride[axis]
-            level.start[axis] = self._address(start * stride[axis] + (numbers if axis == 0 else 0))
+            level.start[axis] = self._held(start * stride[axis] + (numbers if axis == 0 else 0))
         of_time = np.zeros((len(weights[0]), 2), np.float32)
         of_time[:, : weights[0].shape[2]] = weights[0][:, 0]
-        level.time = self._address(of_time)
+        level.time = self._held(of_time)
         for number, weight in enumerate(weights[1:3]):
             first, two = two_corners(weight)
-            level.first[number] = self._address(first)
-            level.weight[number] = self._address(two)
+            level.first[number] = self._held(first)
+            level.weight[number] = self._held(two)
         reach, spread = groups_of_corners(weights[3])
-        level.reach = self._address(reach)
-        level.spread = self._address(spread)
-        level.gathered = self._address(np.ascontiguousarray(spread.swapaxes(2, 3)))
+        level.reach = self._held(reach)
+        level.spread = self._held(spread)
+        level.gathered = self._held(np.ascontiguousarray(spread.swapaxes(2, 3)))
 
-    def _address(self, array: npt.NDArray[Any]) -> int:
-        """Keep an array and return its address."""
+    def _held(self, array: npt.NDArray[Any]) -> Any:
+        """Keep an array and return a pointer to its numbers."""
         self.arrays.append(array)
-        return array.ctypes.data
+        return pointer(array)
 
 
 def two_corners(
@@ -246,8 +158,8 @@ STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "fl
 """Arrays of the state of every engine."""
 FLUSH = 1024
 """Bricks that are brought up to date at a time."""
-PAD = 64
-"""Numbers behind the flat ones that a vector may read or rewrite; FHASH_PAD in bricks.hpp."""
+PAD: int = ffi.integer_const("FHASH_PAD")
+"""Numbers behind the flat ones that a vector may read or rewrite."""
 RATES = {"x86-64-v4": 65e9, "x86-64-v3": 50e9, "baseline": 25e9}
 """Operations a second of a training in one thread, by the instructions (docs/results.md).
 
@@ -362,11 +274,11 @@ class NativeEngine:
         task, threads = self._task, self._threads(len(bricks))
         task.threads, task.step = threads, self.step
         task.rate, task.scale = float(self.rates[self.step]), 2.0 / max(samples, 1)
-        task.chosen, task.count = bricks.ctypes.data, len(bricks)
+        task.chosen, task.count = pointer(bricks), len(bricks)
         errors = np.zeros(threads)
-        task.error = errors.ctypes.data
+        task.error = pointer(errors)
         assert self._native is not None
-        task.touches = self._native.fhash_bricks_touch(ctypes.byref(task))
+        task.touches = self._native.fhash_bricks_touch(task)
         self._run(CATCH_UP, ADAM)
         return float(errors.sum())
 
@@ -378,9 +290,9 @@ class NativeEngine:
         values = np.empty(int(places[-1]), np.float32)
         task, threads = self._task, self._threads(len(chosen))
         task.threads, task.step = threads, self.step
-        task.chosen, task.count = chosen.ctypes.data, len(chosen)
-        task.out, task.places = values.ctypes.data, places.ctypes.data
-        task.current = self._settled_flat()[0].ctypes.data
+        task.chosen, task.count = pointer(chosen), len(chosen)
+        task.out, task.places = pointer(values), pointer(places)
+        task.current = pointer(self._settled_flat()[0])
         self._run(INFER, INFER)
         return values
 
@@ -443,10 +355,10 @@ class NativeEngine:
             for array, behind in zip(numbers, state["behind"], strict=True):
                 array[: self.lazy] = behind
 
-    def _new_task(self) -> Bricks:
-        """Return the structure with all that stays as it is."""
+    def _new_task(self) -> Any:
+        """Return the `FhashBricks` with all that stays as it is."""
         architecture, coreset = self.architecture, self.coreset
-        task = Bricks(
+        fields = dict(
             path=PATHS[self.path],
             embedding=architecture.embedding_size,
             own=len(self.fine),
@@ -460,16 +372,16 @@ class NativeEngine:
             coarse=self.coarse,
             numbers=len(self.flat),
             lazy=self.lazy,
-            rank=None if self._rank is None else self._rank.ctypes.data,
+            rank=pointer(self._rank),
             level=self._tables.levels,
-            stamps=self._stamps.ctypes.data,
-            touched=self._touched.ctypes.data,
+            stamps=pointer(self._stamps),
+            touched=pointer(self._touched),
         )
         own = {name: getattr(self, name) for name in (*STATE, "blocks")}
-        for name, array in (self._coreset_arrays | own).items():
-            setattr(task, name, array.ctypes.data)
+        pointers = {name: pointer(array) for name, array in (self._coreset_arrays | own).items()}
+        task = ffi.new("FhashBricks *", fields | pointers)
         assert self._native is not None
-        task.work_size = self._native.fhash_bricks_work(ctypes.byref(task))
+        task.work_size = self._native.fhash_bricks_work(task)
         assert task.work_size > 0
         return task
 
@@ -481,21 +393,21 @@ class NativeEngine:
             # A cache line more, so that the memory can begin with one.
             work = np.zeros(threads * self._task.work_size + 16, np.float32)
             self._memory["work"] = work
-            self._task.gradient = self._memory["gradient"].ctypes.data
-            self._task.work = -(-work.ctypes.data // 64) * 64
+            self._task.gradient = pointer(self._memory["gradient"])
+            self._task.work = pointer(work[-work.ctypes.data % 64 // work.itemsize :])
         return threads
 
     def _run(self, first: int, last: int) -> None:
         """Let all threads do their shares in the parts `first` to `last` of the task."""
         assert self._native is not None
-        result = self._native.fhash_bricks_run(ctypes.byref(self._task), first, last)
+        result = self._native.fhash_bricks_run(self._task, first, last)
         assert not result, f"parts {first} to {last} of the native engine returned {result}"
 
     def _gap_tables(self) -> _GapTables:
         """Return the closed form of missed steps at the present learning rates."""
         if self._gaps is None or self._gaps.rates is not self.rates:
             self._gaps = _GapTables(self.rates)
-            self._task.gaps = self._gaps.structure
+            self._task.gaps = self._gaps.structure[0]
         return self._gaps
 
     def _catch_up_gaps(self) -> None:
@@ -503,7 +415,7 @@ class NativeEngine:
         tables = self._gap_tables()
         if tables.step < self.step:
             assert self._native is not None
-            self._native.fhash_bricks_gaps(ctypes.byref(self._task), tables.step + 1, self.step)
+            self._native.fhash_bricks_gaps(self._task, tables.step + 1, self.step)
             tables.step = self.step
 
     def _settled_flat(self) -> list[Single]:
@@ -531,7 +443,7 @@ class _GapTables:
     Attributes:
         rates: learning rate of every step, counted from 1.
         step: step up to which the sums are known.
-        structure: the addresses of the tables.
+        structure: pointers to the tables.
     """
 
     def __init__(self, rates: npt.NDArray[np.float64]) -> None:
@@ -549,7 +461,8 @@ class _GapTables:
             "mean_decay": (BETA1 ** steps.astype(np.float64)).astype(np.float32),
             "square_decay": (BETA2 ** steps.astype(np.float64)).astype(np.float32),
         }
-        self.structure = Gaps(**{name: a.ctypes.data for name, a in self._tables.items()})
+        pointers = {name: pointer(array) for name, array in self._tables.items()}
+        self.structure = ffi.new("FhashGaps *", pointers)
 
     def settle(
         self,

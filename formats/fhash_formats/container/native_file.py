@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import threading
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -17,31 +16,9 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.container.zip_file import Source
 from fhash_formats.errors import InputError
+from fhash_formats.native import ffi, pointer
 from fhash_formats.support.threads import ForkLock, usable_threads
-from fhash_formats.transform.tile import call, context
-
-_READ = ctypes.CFUNCTYPE(
-    ctypes.c_int32, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint64, ctypes.c_void_p
-)
-_ANNOUNCE = ctypes.CFUNCTYPE(
-    None, ctypes.c_void_p, ctypes.POINTER(ctypes.c_uint64), ctypes.c_uint64
-)
-
-
-class _Node(ctypes.Structure):
-    _fields_ = (
-        ("path", ctypes.c_char_p),
-        ("text", ctypes.c_void_p),
-        *((name, ctypes.c_uint64) for name in ("text_size", "document", "stored", "place")),
-        ("array", ctypes.c_int64),
-    )
-
-
-class _Chunk(ctypes.Structure):
-    _fields_ = (
-        ("shape", ctypes.c_int64 * 8),
-        *((name, ctypes.c_void_p) for name in ("values", "mask", "owner")),
-    )
+from fhash_formats.transform.tile import checked, context
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +42,10 @@ class Node:
     number: int
 
 
-def _node(found: _Node) -> Node:
+def _node(found: Any) -> Node:
     return Node(
-        path=found.path.decode("ascii"),
-        text=ctypes.string_at(found.text, found.text_size),
+        path=_text(found.path),
+        text=bytes(ffi.buffer(found.text, found.text_size)),
         document_bytes=found.document,
         stored_bytes=found.stored,
         place_bytes=found.place,
@@ -76,15 +53,16 @@ def _node(found: _Node) -> Node:
     )
 
 
-def _integers(numbers: Iterable[int]) -> Any:
-    listed = list(numbers)
-    return (ctypes.c_int64 * len(listed))(*listed)
+def _text(found: Any) -> str:
+    return str(ffi.string(found).decode("ascii"))
 
 
 class _Kept:
     """A decoded chunk of libfhash, for as long as an array shows its values."""
 
-    def __init__(self, address: int, shape: Sequence[int], dtype: np.dtype[Any], owner: _Owner):
+    def __init__(
+        self, address: int, shape: Sequence[int], dtype: np.dtype[Any], owner: object
+    ) -> None:
         self.owner = owner
         self.__array_interface__ = {
             "data": (address, True),
@@ -94,13 +72,6 @@ class _Kept:
         }
 
 
-class _Owner:
-    """The right to the memory of a chunk."""
-
-    def __init__(self, address: int) -> None:
-        weakref.finalize(self, native.library().fhash_chunk_free, address)
-
-
 def _functions(source: Source, failures: threading.local) -> tuple[Any, Any]:
     """Functions by which the library reads a source, and tells it what it will read.
 
@@ -108,9 +79,9 @@ def _functions(source: Source, failures: threading.local) -> tuple[Any, Any]:
     raises becomes `failures.error`.
     """
 
-    def read(_: object, offset: int, size: int, room: int) -> int:
+    def read(_: object, offset: int, size: int, room: Any) -> int:
         try:
-            ctypes.memmove(room, source.read(offset, size), size)
+            ffi.memmove(room, source.read(offset, size), size)
         except BaseException as error:
             failures.error = error
             return 1
@@ -122,10 +93,11 @@ def _functions(source: Source, failures: threading.local) -> tuple[Any, Any]:
         except BaseException as error:
             failures.error = error
 
-    return _READ(read), _ANNOUNCE(announce) if source.gap else _ANNOUNCE()
+    told = ffi.callback("fhash_announce_function", announce) if source.gap else ffi.NULL
+    return ffi.callback("fhash_read_function", read, error=1), told
 
 
-def _release(handles: dict[int, ctypes.c_void_p], process: int) -> None:
+def _release(handles: dict[int, Any], process: int) -> None:
     """Close the handles of a file, in the process that opened it."""
     if process == os.getpid():
         for handle in handles.values():
@@ -151,22 +123,22 @@ class NativeFile:
         self._failures = threading.local()
         self._closed, self._users = False, 0
         self._functions = _functions(source, self._failures)
-        self._handles: dict[int, ctypes.c_void_p] = {}
+        self._handles: dict[int, Any] = {}
         self._open()
         weakref.finalize(self, _release, self._handles, os.getpid()).atexit = False
 
     def _open(self) -> None:
         """Open the file in this process: a lock of the library may be held for ever in a fork."""
-        threads, handle = usable_threads(), ctypes.c_void_p()
-        given = (context(threads), *self._functions, None, self._source.size)
-        self._call("fhash_file_open", *given, ctypes.byref(handle))
-        native.library().fhash_file_cache(handle, self._cache_bytes)
+        threads, made = usable_threads(), ffi.new("fhash_file **")
+        given = (context(threads), *self._functions, ffi.NULL, self._source.size, made)
+        self._call("fhash_file_open", *given)
+        native.library().fhash_file_cache(made[0], self._cache_bytes)
         self._handles.clear()
-        self._handles[threads] = handle
+        self._handles[threads] = made[0]
         self._process, self._users = os.getpid(), 0
 
     @contextmanager
-    def _using(self) -> Iterator[ctypes.c_void_p]:
+    def _using(self) -> Iterator[Any]:
         """The handle that reads with as many threads as may be used, for a block."""
         threads = usable_threads()
         with self._lock:
@@ -175,9 +147,9 @@ class NativeFile:
             if self._process != os.getpid():
                 self._open()
             if threads not in self._handles:
-                made, first = ctypes.c_void_p(), next(iter(self._handles.values()))
-                self._call("fhash_file_with", context(threads), first, ctypes.byref(made))
-                self._handles[threads] = made
+                made, first = ffi.new("fhash_file **"), next(iter(self._handles.values()))
+                self._call("fhash_file_with", context(threads), first, made)
+                self._handles[threads] = made[0]
             handle = self._handles[threads]
             self._users += 1
         try:
@@ -204,30 +176,28 @@ class NativeFile:
 
     def nodes(self) -> list[Node]:
         """The groups and arrays, in the order of the file."""
-        found, number, listed = _Node(), 0, []
+        found, listed = ffi.new("fhash_node *"), []
         with self._using() as handle:
-            while native.library().fhash_file_node(handle, number, ctypes.byref(found)):
-                number += 1
+            while native.library().fhash_file_node(handle, len(listed), found):
                 listed.append(_node(found))
         return listed
 
     def places(self, variable: int) -> dict[str, int]:
         """Numbers of the arrays of a variable by their names. variable: its number, from 0."""
         found: dict[str, int] = {}
-        name, array = ctypes.c_char_p(), ctypes.c_int64()
-        results = (ctypes.byref(name), ctypes.byref(array))
+        name, array = ffi.new("char const **"), ffi.new("int64_t *")
         with self._using() as handle:
-            while native.library().fhash_file_place(handle, variable, len(found), *results):
-                found[(name.value or b"").decode("ascii")] = array.value
+            while native.library().fhash_file_place(handle, variable, len(found), name, array):
+                found[_text(name[0])] = array[0]
         return found
 
     @property
     def digest(self) -> str:
         """SHA-256 of the directory, hexadecimal."""
-        text = ctypes.create_string_buffer(65)
+        text = ffi.new("char[65]")
         with self._using() as handle:
             native.library().fhash_file_digest(handle, text)
-        return text.value.decode("ascii")
+        return _text(text)
 
     def read(
         self,
@@ -247,30 +217,29 @@ class NativeFile:
             mask: likewise which of them are occupied.
             keep: whether the cache keeps the chunks.
         """
-        ends = _integers(end for along in bounds for end in along)
-        rooms = (None if room is None else room.ctypes.data for room in (values, mask))
-        self._asked("fhash_array_read", number, ends, keep, *rooms)
+        ends = [end for along in bounds for end in along]
+        self._asked("fhash_array_read", number, ends, keep, pointer(values), pointer(mask))
 
     def chunk(
         self, number: int, index: Sequence[int], lod: int, dtype: np.dtype[Any], *, keep: bool
     ) -> npt.NDArray[Any]:
         """A full chunk, padding included, read-only. dtype: of the array."""
-        found = _Chunk()
-        given = (number, _integers(index), lod, keep, ctypes.byref(found))
-        self._asked("fhash_array_chunk", *given)
-        owner = _Owner(found.owner)
-        return np.asarray(_Kept(found.values, found.shape[: len(index)], dtype, owner))
+        found = ffi.new("fhash_chunk *")
+        self._asked("fhash_array_chunk", number, list(index), lod, keep, found)
+        shape = found.shape[0 : len(index)]
+        # The library releases the chunk once no array shows its values.
+        owner = ffi.gc(found.owner, native.library().fhash_chunk_free)
+        return np.asarray(_Kept(int(ffi.cast("intptr_t", found.values)), shape, dtype, owner))
 
     def stored(self, number: int, index: Sequence[int]) -> tuple[int, int, str]:
         """Offset and number of the bytes of a chunk, and the member of the file that has them."""
-        range_, member = (ctypes.c_uint64 * 2)(), ctypes.c_char_p()
-        given = (number, _integers(index), range_, ctypes.byref(member))
-        self._asked("fhash_array_stored", *given)
-        return range_[0], range_[1], (member.value or b"").decode("ascii")
+        place, member = ffi.new("uint64_t[2]"), ffi.new("char const **")
+        self._asked("fhash_array_stored", number, list(index), place, member)
+        return place[0], place[1], _text(member[0])
 
     def announce(self, number: int, bounds: Sequence[tuple[int, int]]) -> None:
         """Let the source fetch the chunks of a region, with their padding."""
-        ends = _integers(end for along in bounds for end in along)
+        ends = [end for along in bounds for end in along]
         self._asked("fhash_array_announce", number, ends)
 
     def check(self, number: int) -> None:
@@ -281,7 +250,7 @@ class NativeFile:
         """Call a function; raises what the source raised, or else what its status means."""
         self._failures.error = None
         try:
-            call(name, *arguments)
+            checked(name, *arguments)
         except Exception:
             if self._failures.error is None:
                 raise

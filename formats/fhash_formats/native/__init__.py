@@ -1,146 +1,111 @@
-"""Loader of the native library: C++ kernels that are called through ctypes.
+"""Loader of the native library: C++ kernels that are called through cffi.
 
 A call releases Python's global interpreter lock. The library is a part of the package: it is built
 when the package is installed, and without it nothing works. tests/reference decodes the same bits
 in numpy.
 
-`PROTOTYPES` lists the exported functions that this package calls, with the types of their
-arguments. Every kernel returns an int64: at least 0 for success, below 0 for an error (core.hpp).
+`ffi` knows the functions and structures of fhash.h and functions.h. Every kernel returns an int64:
+at least 0 for success, below 0 for an error (core.hpp). Arrays are given as `pointer(array)`, and
+sizes and other few numbers as a tuple or a list; cffi refuses a pointer to another type.
 """
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_formats.errors import MissingDependencyError
 from fhash_formats.support.threads import ForkLock
 
+try:
+    from fhash_formats.native.declarations import ffi
+except ModuleNotFoundError as error:
+    raise MissingDependencyError(
+        f"the native library was not built ({error}): install the package again (pip install .)"
+    ) from error
+
 __all__ = [
     "ABI_VERSION",
-    "ARRAY",
-    "FLOAT",
     "FOLDER",
-    "INTEGER",
-    "PROTOTYPES",
-    "REAL",
+    "Library",
     "crc32c",
+    "ffi",
     "library",
     "load_library",
+    "pointer",
 ]
 
-ABI_VERSION = 25
+ABI_VERSION = 26
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
-
-ARRAY = ctypes.c_void_p
-"""Argument type of a pointer: an address, None, a `c_void_p`, or a ctypes array or pointer."""
-INTEGER = ctypes.c_int64
-"""Argument type of a size, a count or a flag."""
-REAL = ctypes.c_double
-"""Argument type of a float64 number."""
-FLOAT = ctypes.c_float
-"""Argument type of a float32 number."""
-
-Prototypes = Mapping[str, tuple[Any, ...]]
-"""Argument types of native functions by name; the result of each is an int64."""
-
-_TILE = (ARRAY, ARRAY)
-"""Context and tile."""
-_STREAM = (*_TILE, ARRAY, ctypes.c_size_t)
-
-_TILES: Prototypes = {
-    "fhash_context_create": (ctypes.c_uint64, ctypes.c_int32),
-    "fhash_tile_decode": (*_STREAM, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
-    "fhash_tile_table": (*_STREAM, ctypes.c_int32, *(ARRAY,) * 4),
-    "fhash_tile_uncorrected": (*_STREAM, *(ARRAY,) * 4),
-    "fhash_tile_part": (*_TILE, *(ARRAY,) * 4),
-    "fhash_tile_fill": (*_TILE, ARRAY, ARRAY, ctypes.c_int32, ARRAY, ARRAY),
-    "fhash_tile_forward": (*_TILE, *(ARRAY,) * 3),
-    "fhash_tile_foretold": (*_TILE, *(ARRAY,) * 4),
-    "fhash_tile_code": (*_TILE, *(ARRAY,) * 8),
-    "fhash_plan": (*(ARRAY,) * 4,),
-    "fhash_tile_free": (ARRAY,),
-    "fhash_tile_bound": (ARRAY,),
-    "fhash_file_open": (*(ARRAY,) * 4, ctypes.c_uint64, ARRAY, ARRAY),
-    "fhash_file_with": (ARRAY,) * 4,
-    "fhash_file_node": (ARRAY, INTEGER, ARRAY),
-    "fhash_file_place": (ARRAY, ctypes.c_int32, INTEGER, ARRAY, ARRAY),
-    "fhash_file_digest": (ARRAY, ARRAY),
-    "fhash_file_cache": (ARRAY, ctypes.c_uint64),
-    "fhash_array_read": (ARRAY, INTEGER, ARRAY, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
-    "fhash_array_chunk": (ARRAY, INTEGER, ARRAY, *(ctypes.c_int32,) * 2, ARRAY, ARRAY),
-    "fhash_array_stored": (ARRAY, INTEGER, *(ARRAY,) * 4),
-    "fhash_array_announce": (ARRAY, INTEGER, ARRAY, ARRAY),
-    "fhash_array_check": (ARRAY, INTEGER, ARRAY),
-    "fhash_chunk_free": (ARRAY,),
-    "fhash_close": (ARRAY,),
-    "fhash_tile_encode": (*_TILE, *(ARRAY,) * 4, ctypes.c_size_t, ARRAY, ARRAY),
-}
-"""Functions of fhash.h, part.cpp and arrays.hpp, whose result is an int32."""
-_RESULTS = {
-    "fhash_context_create": ctypes.c_void_p,
-    "fhash_tile_bound": ctypes.c_size_t,
-    "fhash_chunk_free": None,
-    "fhash_close": None,
-}
-"""Other results."""
-
-PROTOTYPES: Prototypes = {
-    **_TILES,
-    "fhash_encode_block": (*(ARRAY,) * 3, INTEGER),
-    "fhash_decode_block": (ARRAY, INTEGER, ARRAY, ARRAY),
-    "fhash_head_apply": (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, ARRAY),
-    "fhash_crc32c": (ARRAY, INTEGER, INTEGER, INTEGER),
-    "fhash_between": (ARRAY, ARRAY, INTEGER, ARRAY, INTEGER, ARRAY, ARRAY),
-}
-"""Functions of this package's library that Python calls."""
-
-_ADVICE = "install the package again (pip install .)"
 FOLDER = Path(__file__).parent
 """Folder of libfhash with its header and build files; also that of HDF5's plugin, libfhash."""
+
+_ADVICE = "install the package again (pip install .)"
 _LOCK = ForkLock()
-_LOADED: dict[tuple[Path, str, int], ctypes.CDLL] = {}
+_LOADED: dict[tuple[Path, str, int], Library] = {}
+_TYPES = {
+    np.dtype(name): ffi.typeof(f"{kind}[]")
+    for name, kind in {
+        **{
+            f"{sign}int{bits}": f"{sign}int{bits}_t"
+            for sign in ("", "u")
+            for bits in (8, 16, 32, 64)
+        },
+        **{"float32": "float", "float64": "double", "bool": "uint8_t", "float16": "uint16_t"},
+    }.items()
+}
+"""Types of C of arrays."""
 
 
-class _Library(ctypes.CDLL):
-    """A library; functions that libfhash does not export are found by `fhash_function`."""
+class Library:
+    """Functions of a loaded library by their names; those that are not exported are found, too."""
 
-    def __getitem__(self, name: Any) -> Any:
+    def __init__(self, ffi: Any, path: Path) -> None:
+        self._ffi, self._exported = ffi, ffi.dlopen(str(path))
+
+    def __getattr__(self, name: str) -> Any:
         try:
-            return super().__getitem__(name)
+            function = getattr(self._exported, name)
         except AttributeError:
-            find = super().__getitem__("fhash_function")
-            find.restype, find.argtypes = ctypes.c_void_p, (ctypes.c_char_p,)
-            address = find(name.encode("ascii"))
-            if address is None:
+            # A type of the function's name stands for it (setup.py).
+            address = self._exported.fhash_function(name.encode("ascii"))
+            if not address:
                 raise
-            return self._FuncPtr(address)
+            function = self._ffi.cast(f"{name} *", address)
+        setattr(self, name, function)
+        return function
 
 
-def library() -> ctypes.CDLL:
+def library() -> Library:
     """The native library of this package; see `load_library`."""
-    return load_library(FOLDER, "libfhash", ABI_VERSION, PROTOTYPES)
+    return load_library(FOLDER, "libfhash", ABI_VERSION, ffi)
+
+
+def pointer(array: npt.NDArray[Any] | None) -> Any:
+    """The numbers of a contiguous array, as a function of C takes them; NULL for None.
+
+    Whoever keeps the pointer keeps the array.
+    """
+    return ffi.NULL if array is None else ffi.from_buffer(_TYPES[array.dtype], array)
 
 
 def crc32c(data: bytes | memoryview) -> int:
     """CRC-32C (Castagnoli) of some bytes."""
-    given = data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8).ctypes.data
-    return int(library().fhash_crc32c(given, len(data), 0, 0))
+    return int(library().fhash_crc32c(ffi.from_buffer(data), len(data), 0, 0))
 
 
 def load_library(
     folder: Path,
     name: str,
     abi_version: int,
-    prototypes: Prototypes,
+    ffi: Any,
     *,
     version_symbol: str = "fhash_abi_version",
-) -> ctypes.CDLL:
-    """The native library `name` in a folder, its functions given their argument and result types.
+) -> Library:
+    """The native library `name` in a folder.
 
     A library is loaded once. Safe to call from several threads.
 
@@ -148,44 +113,35 @@ def load_library(
         folder: folder of the Python package to which the library belongs.
         name: file name of the library without its suffix.
         abi_version: number that the library's function `version_symbol` must return.
-        prototypes: argument types of the functions that will be called.
-        version_symbol: exported function without arguments that returns the library's ABI number.
+        ffi: declarations of its functions.
+        version_symbol: function without arguments that returns the library's ABI number.
 
     Raises:
-        MissingDependencyError: the library is not there, cannot be loaded, lacks a function, or
+        MissingDependencyError: the library is not there, cannot be loaded, lacks that function, or
             was built from other sources (another ABI number).
     """
     key = (folder, name, abi_version)
     if key not in _LOADED:
         with _LOCK:
             if key not in _LOADED:
-                path = folder / f"{name}.so"  # on every system: ctypes asks for no other name
+                path = folder / f"{name}.so"  # on every system: cffi asks for no other name
                 if not path.is_file():
                     raise MissingDependencyError(f"there is no native library {path}: {_ADVICE}")
-                _LOADED[key] = _load(path, abi_version, prototypes, version_symbol)
+                _LOADED[key] = _load(path, abi_version, ffi, version_symbol)
     return _LOADED[key]
 
 
-def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: str) -> ctypes.CDLL:
+def _load(path: Path, abi_version: int, ffi: Any, version_symbol: str) -> Library:
     try:
-        loaded = _Library(str(path))
-        _declare(loaded, version_symbol, ())
+        loaded = Library(ffi, path)
         built = getattr(loaded, version_symbol)()
-        if built != abi_version:
-            raise MissingDependencyError(
-                f"the native library {path} has ABI {built}, "
-                f"this version of the package needs {abi_version}: {_ADVICE}"
-            )
-        for function, arguments in prototypes.items():
-            _declare(loaded, function, arguments)
     except (OSError, AttributeError) as error:
         raise MissingDependencyError(
             f"the native library {path} cannot be used ({error}): {_ADVICE}"
         ) from error
+    if built != abi_version:
+        raise MissingDependencyError(
+            f"the native library {path} has ABI {built}, "
+            f"this version of the package needs {abi_version}: {_ADVICE}"
+        )
     return loaded
-
-
-def _declare(loaded: ctypes.CDLL, name: str, arguments: tuple[Any, ...]) -> None:
-    function = getattr(loaded, name)
-    function.argtypes = arguments
-    function.restype = _RESULTS.get(name, ctypes.c_int32 if name in _TILES else ctypes.c_int64)

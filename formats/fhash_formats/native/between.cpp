@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "core.hpp"
+#include "functions.h"
 
 namespace fhash {
 

@@ -19,6 +19,7 @@
 #include <vector>
 
 #include "coder_signs.hpp"
+#include "functions.h"
 
 namespace {
 

@@ -6,6 +6,7 @@
 #include <cstring>
 
 #include "core.hpp"
+#include "functions.h"
 
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(FHASH_PLAIN)
 #include <nmmintrin.h>

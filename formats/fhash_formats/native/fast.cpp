@@ -1,6 +1,7 @@
 // The fast coder (fast.hpp).
 #include "fast_decode.hpp"
 #include "fast_encode.hpp"
+#include "functions.h"
 
 // Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (plan.cpp), or
 // foretell what that takes. Integers outside the bands count as 0.

@@ -10,6 +10,7 @@
 #endif
 
 #include "core.hpp"
+#include "functions.h"
 #include "head_frames.hpp"
 #include "head_lanes_wide.hpp"
 #include "head_network.hpp"

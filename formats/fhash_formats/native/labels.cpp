@@ -12,6 +12,7 @@
 // the highest so far.
 #include <bitset>
 
+#include "functions.h"
 #include "mixing.hpp"
 #include "rows.hpp"
 #include "target.hpp"

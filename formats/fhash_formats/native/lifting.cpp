@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "core.hpp"
+#include "functions.h"
 #include "guard.hpp"
 #include "lifting_tile.hpp"
 #include "threads.hpp"

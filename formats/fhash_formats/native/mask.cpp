@@ -9,6 +9,7 @@
 #include <cstdlib>
 #include <type_traits>
 
+#include "functions.h"
 #include "mixing.hpp"
 #include "rows.hpp"
 #include "target.hpp"

@@ -9,6 +9,7 @@
 #include <cstring>
 #include <vector>
 
+#include "functions.h"
 #include "guard.hpp"
 
 namespace {

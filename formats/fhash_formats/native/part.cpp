@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "core.hpp"
+#include "functions.h"
 #include "encode.hpp"
 #include "priors.hpp"
 

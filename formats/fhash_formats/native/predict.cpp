@@ -16,6 +16,7 @@
 #include <cstdlib>
 #include <type_traits>
 
+#include "functions.h"
 #include "mixing.hpp"
 #include "target.hpp"
 

@@ -7,6 +7,7 @@
 #include <cstring>
 
 #include "core.hpp"
+#include "functions.h"
 
 namespace {
 

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "coder_contexts.hpp"
+#include "functions.h"
 
 namespace {
 

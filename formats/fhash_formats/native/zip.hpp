@@ -7,17 +7,15 @@
 #include <vector>
 
 #include "context.hpp"
+#include "functions.h"
 
 namespace fhash {
-
-// Is told ranges, pairs of offset and length, that will be read soon, each as it stands there.
-using Announce = void (*)(void* user, const uint64_t* ranges, uint64_t count);
 
 // A file that the caller's function reads. Its end is kept: small files are read once.
 struct Source {
     const fhash_context* context = nullptr;
     fhash_read_function function = nullptr;
-    Announce announced = nullptr;  // or null: where every read costs the same
+    fhash_announce_function announced = nullptr;  // or null: where every read costs the same
     void* user = nullptr;
     uint64_t size = 0;
     uint64_t tail_at = 0;  // offset of `tail`

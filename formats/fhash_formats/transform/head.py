@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import struct
 from bisect import bisect_right
 from collections import Counter
@@ -18,6 +17,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.native import pointer
 from fhash_formats.support.threads import in_threads, row_parts, usable_threads
 from fhash_formats.support.values import Single
 
@@ -305,13 +305,13 @@ class NeighbourHead:
 
         def correct(part: tuple[int, int]) -> None:
             code = native.library().fhash_head_apply(
-                ctypes.c_void_p(source.ctypes.data),
-                (ctypes.c_int64 * 4)(*source.shape),
+                pointer(source),
+                source.shape,
                 *part,
                 len(self.layers),
-                *(array.ctypes.data_as(ctypes.c_void_p) for array in arguments),
+                *map(pointer, arguments),
                 _WIDEST_LANES,
-                ctypes.c_void_p(out.ctypes.data),
+                pointer(out),
             )
             if code != 0:
                 raise MemoryError(

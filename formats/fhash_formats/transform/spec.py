@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import struct
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.native import pointer
 from fhash_formats.support.values import Integers
 
 NO_MEMORY = -2
@@ -27,12 +27,10 @@ def encode_block(integers: Integers) -> bytes:
     """Code a small block of int32 integers (four axes) that stands alone."""
     given = np.ascontiguousarray(integers, np.int32)
     room = np.empty(8 * given.size + 4096, np.uint8)
-    shape = (ctypes.c_int64 * 4)(*given.shape)
     if not given.size:
         return b""
-    size = checked(
-        native.library().fhash_encode_block(given.ctypes.data, shape, room.ctypes.data, room.size)
-    )
+    coder = native.library().fhash_encode_block
+    size = checked(coder(pointer(given), given.shape, pointer(room), room.size))
     assert 0 <= size <= room.size, "eight bytes are enough for an integer"
     return room[:size].tobytes()
 
@@ -48,7 +46,7 @@ def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
         return np.zeros(shape, dtype=np.int32)
     integers, source = np.zeros(shape, np.int32), np.frombuffer(data, np.uint8)
     code = native.library().fhash_decode_block(
-        source.ctypes.data, source.size, (ctypes.c_int64 * 4)(*shape), integers.ctypes.data
+        pointer(source), source.size, shape, pointer(integers)
     )
     if checked(code) < 0:
         raise DamagedFileError("the coded integers are damaged")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, FhashError, InputError, UnsupportedFileError
+from fhash_formats.native import ffi, pointer
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.support.values import Integers, Mask, Values, as_array
 from fhash_formats.transform.predict import Predictor
@@ -44,114 +44,67 @@ DENSITIES = (1, 8)
 MAX_MISSING = 16
 """Values that an array may have for missing ones (native/chunk.cpp)."""
 
-_MEMORY = -2
-"""Status of the native library (fhash.h)."""
-_ERRORS: dict[int, type[FhashError]] = {-3: DamagedFileError, -4: UnsupportedFileError}
-"""Errors by their status there; InputError for others."""
+_MEMORY, _DAMAGED, _UNSUPPORTED = (
+    ffi.integer_const(f"FHASH_ERROR_{name}") for name in ("MEMORY", "DAMAGED", "UNSUPPORTED")
+)
+_ERRORS: dict[int, type[FhashError]] = {
+    _DAMAGED: DamagedFileError,
+    _UNSUPPORTED: UnsupportedFileError,
+}
+"""Errors by their status in the native library; InputError for others."""
+_OPTIONS = [name for name, _ in ffi.typeof("fhash_coding").fields]
+"""Names of the options of a `Coding` that the library knows."""
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 """Types of arrays in the order of their numbers in fhash.h, from 1."""
 
-_OPTIONS = (
-    "rounds",
-    "passes",
-    "filled",
-    "density",
-    "keep_missing",
-    "own_settings",
-    "fast",
-)
-"""Whole numbers and switches of a `Coding`, in the order of native/encode.hpp."""
-
-
-class _Error(ctypes.Structure):
-    _fields_ = (("status", ctypes.c_int32), ("text", ctypes.c_char * 500))
-
-
-class _Coding(ctypes.Structure):
-    _fields_ = (
-        ("weight", ctypes.c_double),
-        ("error", ctypes.c_double),
-        ("aim", ctypes.c_double),
-        ("joint", ctypes.c_double),
-        *((name, ctypes.c_int32) for name in _OPTIONS),
-    )
-
-
-class _Quality(ctypes.Structure):
-    _fields_ = (
-        ("max_error", ctypes.c_double),
-        ("max_error_rel", ctypes.c_double),
-        ("step", ctypes.c_double),
-        ("effort", ctypes.c_int32),
-        ("transform_given", ctypes.c_int32),
-        ("transform", ctypes.c_uint8 * 4),
-        ("missing", ctypes.c_int32),
-    )
-
-
-class _Tile(ctypes.Structure):
-    _fields_ = (
-        ("shape", ctypes.c_int64 * 4),
-        ("type", ctypes.c_int32),
-        ("reserved", ctypes.c_int32),
-        ("settings", ctypes.c_char_p),
-        ("settings_size", ctypes.c_size_t),
-    )
-
 
 @lru_cache
-def context(threads: int) -> ctypes.c_void_p:
+def context(threads: int) -> Any:
     """The context of calls that use so many threads."""
-    return ctypes.c_void_p(native.library().fhash_context_create(0, threads))
+    return native.library().fhash_context_create(0, threads)
 
 
 if hasattr(os, "register_at_fork"):  # a thread of the parent may have held the context's lock
     os.register_at_fork(after_in_child=context.cache_clear)
 
 
-def _tile(shape: Shape, dtype: np.dtype[Any], settings: TileSettings | None) -> _Tile:
-    packed = None if settings is None else settings.packed
+def _tile(shape: Shape, dtype: np.dtype[Any], settings: TileSettings | None) -> Any:
+    """A `fhash_tile`; its settings keep the bytes that it points to."""
     number = _TYPES.index(f"{dtype.kind}{dtype.itemsize}") + 1
-    return _Tile((ctypes.c_int64 * 4)(*shape), number, 0, packed, len(packed or b""))
+    if settings is None:
+        return ffi.new("fhash_tile *", (shape, number))
+    packed = settings.packed
+    return ffi.new("fhash_tile *", (shape, number, 0, ffi.from_buffer(packed), len(packed)))
 
 
-def _tile_of(values: Values, settings: TileSettings) -> _Tile:
+def _tile_of(values: Values, settings: TileSettings) -> Any:
     t, z, y, x = values.shape
     return _tile((t, z, y, x), values.dtype, settings)
 
 
-def _call(name: str, tile: _Tile, *arguments: Any) -> None:
-    """Call a function on a tile. Raises DamagedFileError, InputError or MemoryError."""
-    call_with_context(name, ctypes.byref(tile), *arguments)
-
-
-def call_with_context(name: str, *arguments: Any) -> None:
-    """Call a function between a context and room for an error; raises what `call` raises."""
-    call(name, context(usable_threads()), *arguments)
-
-
 def call(name: str, *arguments: Any) -> None:
+    """Call a function between a context and room for an error; raises what `checked` raises."""
+    checked(name, context(usable_threads()), *arguments)
+
+
+def checked(name: str, *arguments: Any) -> None:
     """Call a function with room for an error behind its arguments.
 
     Raises DamagedFileError, UnsupportedFileError, InputError or MemoryError.
     """
-    error = _Error()
-    status = getattr(native.library(), name)(*arguments, ctypes.byref(error))
+    error = ffi.new("fhash_error *")
+    status = getattr(native.library(), name)(*arguments, error)
     if not status:
         return
-    text = error.text.decode("utf-8", "replace")
+    text = ffi.string(error.text).decode("utf-8", "replace")
     if status == _MEMORY:
         raise MemoryError(text)
     raise _ERRORS.get(status, InputError)(text)
 
 
-def _stream(data: bytes | memoryview) -> tuple[ctypes.c_void_p, int]:
-    """Address and size of a stream; the pointer keeps the bytes alive."""
-    return np.frombuffer(data, np.uint8).ctypes.data_as(ctypes.c_void_p), len(data)
-
-
-def _pointer(array: npt.NDArray[Any]) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
+def _stream(data: bytes | memoryview) -> tuple[Any, int]:
+    """The bytes of a stream, and their number."""
+    return ffi.from_buffer(data), len(data)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,7 +184,7 @@ def decode_tile(
     kind = np.dtype(dtype)
     values = np.empty(_lod_shape(shape, lod), kind)
     tile = _tile(shape, kind, settings)
-    _call("fhash_tile_decode", tile, *_stream(data), lod, _pointer(values), None)
+    call("fhash_tile_decode", tile, *_stream(data), lod, pointer(values), ffi.NULL)
     return values
 
 
@@ -248,7 +201,7 @@ def decode_tile_mask(
     kind = np.dtype(dtype)
     values, mask = np.empty(shape, kind), np.empty(shape, np.bool_)
     tile = _tile(shape, kind, settings)
-    _call("fhash_tile_decode", tile, *_stream(data), 0, _pointer(values), _pointer(mask))
+    call("fhash_tile_decode", tile, *_stream(data), 0, pointer(values), pointer(mask))
     return values, mask
 
 
@@ -266,10 +219,10 @@ def decode_tile_table(
     Arguments and errors are those of `decode_tile`.
     """
     room = np.empty(_lod_shape(shape, lod), np.float64)
-    wide, origin = ctypes.c_int32(), (ctypes.c_uint64 * 2)()
-    tile, results = _tile(shape, np.dtype(dtype), settings), (ctypes.byref(wide), origin)
-    _call("fhash_tile_table", tile, *_stream(data), lod, _pointer(room), *results)
-    table = room if wide else room.reshape(-1).view(np.float32)[: room.size].reshape(room.shape)
+    wide, origin = ffi.new("int32_t *"), ffi.new("uint64_t[2]")
+    tile, results = _tile(shape, np.dtype(dtype), settings), (wide, origin)
+    call("fhash_tile_table", tile, *_stream(data), lod, pointer(room), *results)
+    table = room if wide[0] else room.reshape(-1).view(np.float32)[: room.size].reshape(room.shape)
     first = origin[0] - (origin[1] << 64)
     return table.astype(np.float64) + first if first else table
 
@@ -306,13 +259,13 @@ def encode_for(tile: Values, quality: tuple[Any, ...], missing: Values) -> bytes
     *numbers, transform = quality
     t, z, y, x = tile.shape
     of = _tile((t, z, y, x), tile.dtype, None)
-    room = np.empty(native.library().fhash_tile_bound(ctypes.byref(of)), np.uint8)
-    asked = _Quality(*numbers, (ctypes.c_uint8 * 4)(*transform), missing.size)
-    size = ctypes.c_size_t()
-    results = (_pointer(room), room.size, ctypes.byref(size))
-    given = (ctypes.byref(asked), _pointer(missing) if missing.size else None)
-    _call("fhash_tile_encode", of, _pointer(tile), *given, *results)
-    return room[: size.value].tobytes()
+    room = np.empty(native.library().fhash_tile_bound(of), np.uint8)
+    asked = ffi.new("fhash_quality *", (*numbers, transform, missing.size))
+    size = ffi.new("size_t *")
+    results = (pointer(room), room.size, size)
+    given = (asked, pointer(missing if missing.size else None))
+    call("fhash_tile_encode", of, pointer(tile), *given, *results)
+    return room[: size[0]].tobytes()
 
 
 def exact_tile(values: Values, occupied: Mask | None = None, *, origin: int = 0) -> CodedTile:
@@ -336,26 +289,25 @@ def _coded(
     """The coded tile; without settings it is stored without loss."""
     values = np.ascontiguousarray(values)
     given = None if mask is None else np.ascontiguousarray(mask, np.bool_)
-    options = (getattr(coding, name) for name in _OPTIONS)
-    bound = -1 if coding.error is None else coding.error
-    asked = _Coding(coding.weight, bound, coding.aim, coding.joint, *options)
-    decoded = np.empty_like(values)
-    data, size, nonzero = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_size_t(), ctypes.c_int64()
+    options = {name: getattr(coding, name) for name in _OPTIONS}
+    options["error"] = -1 if coding.error is None else coding.error
+    asked, decoded = ffi.new("fhash_coding *", options), np.empty_like(values)
+    data, size, nonzero = ffi.new("uint8_t **"), ffi.new("size_t *"), ffi.new("int64_t *")
     t, z, y, x = values.shape
-    _call(
+    call(
         "fhash_tile_code",
         _tile((t, z, y, x), values.dtype, settings),
-        _pointer(values),
-        None if given is None else _pointer(given),
-        ctypes.byref(asked),
-        _pointer(decoded),
-        *(ctypes.byref(result) for result in (data, size, nonzero)),
+        pointer(values),
+        pointer(given),
+        asked,
+        pointer(decoded),
+        *(data, size, nonzero),
     )
     try:
-        stream = ctypes.string_at(data, size.value)
+        stream = bytes(ffi.buffer(data[0], size[0]))
     finally:
-        native.library().fhash_tile_free(data)
-    return CodedTile(data=stream, decoded=decoded, nonzero=nonzero.value)
+        native.library().fhash_tile_free(data[0])
+    return CodedTile(data=stream, decoded=decoded, nonzero=nonzero[0])
 
 
 def with_trellis(settings: TileSettings) -> TileSettings:
@@ -387,8 +339,8 @@ def filled(
     """
     result = np.array(target, settings.dtype, order="C")
     masks = [np.ascontiguousarray(mask, np.bool_) for mask in (counted, finite)]
-    pointers = [_pointer(array) for array in (*masks, result)]
-    _call("fhash_tile_fill", _tile_of(result, settings), *pointers[:2], density, pointers[2])
+    pointers = [pointer(array) for array in (*masks, result)]
+    call("fhash_tile_fill", _tile_of(result, settings), *pointers[:2], density, pointers[2])
     return result
 
 
@@ -400,7 +352,7 @@ def forward(values: Values, settings: TileSettings) -> Values:
     """
     values = np.ascontiguousarray(values, settings.dtype)
     result = np.empty_like(values)
-    _call("fhash_tile_forward", _tile_of(values, settings), _pointer(values), _pointer(result))
+    call("fhash_tile_forward", _tile_of(values, settings), pointer(values), pointer(result))
     return result
 
 
@@ -417,11 +369,11 @@ def predicted_size(integers: Integers, counted: Mask | None, predictor: Predicto
         high=0.0,
         predictor=predictor,
     )
-    given, size = np.ascontiguousarray(integers, np.int32), ctypes.c_int64()
+    given, size = np.ascontiguousarray(integers, np.int32), ffi.new("int64_t *")
     mask = None if counted is None else np.ascontiguousarray(counted, np.bool_)
-    pointers = (_pointer(given), None if mask is None else _pointer(mask), ctypes.byref(size))
-    _call("fhash_tile_foretold", _tile_of(given, settings), *pointers)
-    return size.value
+    tile = _tile_of(given, settings)
+    call("fhash_tile_foretold", tile, pointer(given), pointer(mask), size)
+    return int(size[0])
 
 
 def _lod_shape(shape: Shape, lod: int) -> tuple[int, ...]:
@@ -443,11 +395,11 @@ def uncorrected(
 
     Raises DamagedFileError for bytes that no encoder writes.
     """
-    table, done = np.empty(shape, np.float32), ctypes.c_int32()
-    results = (_part(part), _pointer(table), ctypes.byref(done))
+    table, done = np.empty(shape, np.float32), ffi.new("int32_t *")
+    results = (_part(part), pointer(table), done)
     tile = _tile(shape, np.dtype(dtype), settings)
-    _call("fhash_tile_uncorrected", tile, *_stream(data), *results)
-    return table if done else None
+    call("fhash_tile_uncorrected", tile, *_stream(data), *results)
+    return table if done[0] else None
 
 
 def corrected_region(
@@ -460,13 +412,13 @@ def corrected_region(
     values = np.empty([along.stop - along.start for along in part], dtype)
     t, z, y, x = table.shape
     tile = _tile((t, z, y, x), values.dtype, settings)
-    _call("fhash_tile_part", tile, _pointer(table), _part(part), _pointer(values))
+    call("fhash_tile_part", tile, pointer(table), _part(part), pointer(values))
     return values
 
 
-def _part(part: tuple[slice, ...]) -> Any:
+def _part(part: tuple[slice, ...]) -> list[int]:
     """First and last vertex along each axis."""
-    return (ctypes.c_int64 * 8)(*(end for along in part for end in (along.start, along.stop)))
+    return [end for along in part for end in (along.start, along.stop)]
 
 
 NO_TRANSFORM = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import warnings
@@ -180,7 +179,7 @@ SHAPES = [
 
 
 @pytest.fixture
-def library() -> ctypes.CDLL:
+def library() -> native.Library:
     return native.library()
 
 
@@ -190,7 +189,7 @@ def network_model(request: pytest.FixtureRequest, networks) -> Network:
     return networks.random(*shape, width=width)
 
 
-def paths(library: ctypes.CDLL) -> list[int]:
+def paths(library: native.Library) -> list[int]:
     return [bit for bit in (1, 2, 4) if library.fhash_network_paths() & bit]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import ctypes
 import gzip
 import hashlib
 import http.client
@@ -42,6 +41,7 @@ from fhash_codec.views.page import FOLDER, PRIORS, WIDGET, Page, embedded
 from fhash_codec.views.server import Server
 from fhash_formats import native
 from fhash_formats.errors import InputError, MissingDependencyError, OutputExistsError
+from fhash_formats.native import ffi, pointer
 
 ROOT = Path(__file__).resolve().parents[3]
 GOLDEN = ROOT / "tests/golden"
@@ -355,26 +355,19 @@ def test_the_page_chooses_the_step_of_render(steady: Path) -> None:
 
 
 def read_natively(
-    library: ctypes.CDLL, run: Path, number: int, step: float, lod: int
+    library: native.Library, run: Path, number: int, step: float, lod: int
 ) -> tuple[np.ndarray, str]:
     """A step as float64 with one kind of NaN, by the library of this machine, and the profile."""
-    create, read = library.fhash_context_create, library.fhash_read
-    create.restype = ctypes.c_void_p
-    context = ctypes.c_void_p(create(ctypes.c_uint64(0), 1))
-    file, error = ctypes.c_void_p(), ctypes.create_string_buffer(504)
-    assert not library.fhash_open_path(context, str(run).encode(), ctypes.byref(file), error), (
-        error.raw[4:]
-    )
-    library.fhash_header.restype = ctypes.c_char_p
-    headers = json.loads(library.fhash_header(file))["variables"]
+    context, file = library.fhash_context_create(0, 1), ffi.new("fhash_file **")
+    error = ffi.new("fhash_error *")
+    assert not library.fhash_open_path(context, str(run).encode(), file, error), error.text
+    headers = json.loads(ffi.string(library.fhash_header(file[0])))["variables"]
     header = list(headers.values() if isinstance(headers, dict) else headers)[number]
     shape = [-(-n // 2**lod) for n in header["domain"]["shape"][1:]]
     values = np.empty(shape)
-    room, whole = ctypes.c_void_p, ctypes.c_int32
-    read.argtypes = [room, whole, ctypes.c_double, room, whole, whole, room, room]
-    assert not read(file, number, step, None, lod, 11, values.ctypes.data, error), error.raw[4:]
-    library.fhash_close.argtypes = library.fhash_context_destroy.argtypes = [ctypes.c_void_p]
-    library.fhash_close(file)
+    read = (file[0], number, step, ffi.NULL, lod, 11, pointer(values), error)
+    assert not library.fhash_read(*read), error.text
+    library.fhash_close(file[0])
     library.fhash_context_destroy(context)
     return np.where(np.isnan(values), np.nan, values), header["model"]["profile"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,7 @@ import pytest
 from reference.tile import decode_tile
 
 from fhash_formats import native
-from fhash_formats.native import crc32c
+from fhash_formats.native import crc32c, ffi, pointer
 from fhash_formats.transform.spec import AxisTransform, MaskLevels, TransformSpec
 from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
@@ -28,96 +27,51 @@ SHAPE = (2, 3, 5, 9)
 Values = npt.NDArray[Any]
 
 
-class Error(ctypes.Structure):
-    _fields_ = (("status", ctypes.c_int32), ("text", ctypes.c_char * 500))
-
-
-class Tile(ctypes.Structure):
-    _fields_ = (
-        ("shape", ctypes.c_int64 * 4),
-        ("type", ctypes.c_int32),
-        ("reserved", ctypes.c_int32),
-        ("settings", ctypes.c_char_p),
-        ("settings_size", ctypes.c_size_t),
-    )
-
-
-class Quality(ctypes.Structure):
-    _fields_ = (
-        ("max_error", ctypes.c_double),
-        ("max_error_rel", ctypes.c_double),
-        ("step", ctypes.c_double),
-        ("effort", ctypes.c_int32),
-        ("transform_given", ctypes.c_int32),
-        ("transform", ctypes.c_uint8 * 4),
-        ("missing", ctypes.c_int32),
-    )
-
-
-LIBRARY = ctypes.CDLL(str(FOLDER / "libfhash.so"))
-POINTER, SIZE, INT = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int32
-for _name, _result, *_arguments in (
-    ("fhash_version", INT),
-    ("fhash_type_size", SIZE, INT),
-    ("fhash_context_create", POINTER, ctypes.c_uint64, INT),
-    ("fhash_context_destroy", None, POINTER),
-    ("fhash_tile_bound", SIZE, POINTER),
-    ("fhash_tile_decode", INT, *(POINTER,) * 3, SIZE, INT, *(POINTER,) * 3),
-    ("fhash_tile_encode", INT, *(POINTER,) * 6, SIZE, *(POINTER,) * 2),
-):
-    _function = getattr(LIBRARY, _name)
-    _function.restype, _function.argtypes = _result, _arguments
+LIBRARY, NULL = native.library(), ffi.NULL
+HELD: list[Any] = []
 
 
 @pytest.fixture
-def context() -> Iterator[int]:
+def context() -> Iterator[Any]:
     made = LIBRARY.fhash_context_create(0, 1)
     yield made
     LIBRARY.fhash_context_destroy(made)
 
 
-def tile_of(shape: tuple[int, ...], dtype: Any, settings: bytes | None = None) -> Tile:
+def tile_of(shape: tuple[int, ...], dtype: Any, settings: bytes | None = None) -> Any:
     kind = TYPES.index(np.dtype(dtype).str[1:]) + 1
-    return Tile((ctypes.c_int64 * 4)(*shape), kind, 0, settings, len(settings or b""))
+    packed = NULL if settings is None else ffi.from_buffer(settings)
+    HELD.append(packed)
+    return ffi.new("fhash_tile *", (shape, kind, 0, packed, len(settings or b"")))
 
 
-def encode(context: int | None, values: Values, room: int = 1 << 16, **given: Any) -> Any:
+def encode(context: Any, values: Values, room: int = 1 << 16, **given: Any) -> Any:
     """Status, text, size and bytes of a stream; given: fields of the quality, `missing`, `tile`."""
     tile = given.pop("tile", tile_of(values.shape, values.dtype))
     missing = np.asarray(given.pop("missing", ()), values.dtype)
-    quality = Quality(**{"max_error": -1.0, "effort": 2, "missing": len(missing), **given})
-    error, size, stream = Error(), SIZE(), ctypes.create_string_buffer(max(room, 1))
+    numbers = {"max_error": -1.0, "effort": 2, "missing": len(missing), **given}
+    quality = ffi.new("fhash_quality *", numbers)
+    error, size, stream = ffi.new("fhash_error *"), ffi.new("size_t *"), bytearray(max(room, 1))
     status = LIBRARY.fhash_tile_encode(
-        context,
-        ctypes.byref(tile),
-        values.ctypes.data,
-        ctypes.byref(quality),
-        missing.ctypes.data if len(missing) else None,
-        stream,
-        room,
-        ctypes.byref(size),
-        ctypes.byref(error),
+        *(context, tile, pointer(values), quality, pointer(missing if len(missing) else None)),
+        *(ffi.from_buffer(stream), room, size, error),
     )
+    text = ffi.string(error.text).decode()
     assert error.status == status
-    assert bool(error.text) == (status != 0)
-    return status, error.text.decode(), size.value, stream.raw[: size.value if not status else 0]
+    assert bool(text) == (status != 0)
+    return status, text, size[0], bytes(stream[: size[0] if not status else 0])
 
 
-def decode(context: int | None, data: bytes, tile: Tile, lod: int = 0, mask: bool = False) -> Any:
+def decode(context: Any, data: bytes, tile: Any, lod: int = 0, mask: bool = False) -> Any:
     """Status, values and mask of a stream; the values are followed by bytes that stay."""
-    shape = (tile.shape[0], *(-(-n // (1 << max(lod, 0))) for n in tile.shape[1:]))
+    steps, *space = tile.shape
+    shape = (steps, *(-(-n // (1 << max(lod, 0))) for n in space))
     dtype = np.dtype(TYPES[(tile.type - 1) % 11])
     room = np.full(int(np.prod(np.maximum(shape, 1))) * dtype.itemsize + 16, 77, np.uint8)
     seen = np.full(int(np.prod(np.maximum(shape, 1))) + 16, 77, np.uint8) if mask else None
     status = LIBRARY.fhash_tile_decode(
-        context,
-        ctypes.byref(tile),
-        data,
-        len(data),
-        lod,
-        room.ctypes.data,
-        None if seen is None else seen.ctypes.data,
-        None,
+        *(context, tile, ffi.from_buffer(data), len(data)),
+        *(lod, pointer(room), pointer(seen), ffi.NULL),
     )
     assert (room[-16:] == 77).all()
     assert seen is None or (seen[-16:] == 77).all()
@@ -162,7 +116,7 @@ def test_every_type_comes_back_as_the_reference_reads_it(dtype: str) -> None:
         assert both[0] == both[1]
         status, _, size, data = both[0]
         assert status == 0
-        assert size <= LIBRARY.fhash_tile_bound(ctypes.byref(tile))
+        assert size <= LIBRARY.fhash_tile_bound(tile)
         expected = decode_tile(data, SHAPE, np.dtype(dtype))[0].tobytes()
         for each in made:
             found, mask = decode(each, data, tile, mask=True)[1:]
@@ -180,7 +134,7 @@ def test_every_type_comes_back_as_the_reference_reads_it(dtype: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "i2", "u8"])
-def test_masks_and_settings_beside_the_stream(dtype: str, context: int) -> None:
+def test_masks_and_settings_beside_the_stream(dtype: str, context: Any) -> None:
     values = field(dtype)
     settings = settings_of(values, mask=MaskLevels(edges=(60.0,), scores=(0, 90), reach=1))
     occupied = values > values.mean()
@@ -218,7 +172,7 @@ def limit_of(quality: dict[str, float], values: Values) -> float:
 
 @pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize("effort", [1, 3])
-def test_missing_values_come_back_bit_by_bit(dtype: str, effort: int, context: int) -> None:
+def test_missing_values_come_back_bit_by_bit(dtype: str, effort: int, context: Any) -> None:
     """Far from the others and among them, one and two of them, in every form of a stream; the
     bounds are those of the other values, and the reference reads the same bits."""
     values = field(dtype)
@@ -237,7 +191,7 @@ def test_missing_values_come_back_bit_by_bit(dtype: str, effort: int, context: i
             assert found.tobytes() == decode_tile(data, SHAPE, np.dtype(dtype))[0].tobytes()
 
 
-def test_values_beside_a_missing_one_beyond_any_difference(context: int) -> None:
+def test_values_beside_a_missing_one_beyond_any_difference(context: Any) -> None:
     """Differences from an origin near one end of int64 do not reach the other end."""
     values = (field("i8") + 2**62).astype("i8")
     values[0, 1] = np.iinfo("i8").min
@@ -251,7 +205,7 @@ def test_values_beside_a_missing_one_beyond_any_difference(context: int) -> None
 
 
 @pytest.mark.parametrize("dtype", ["f4", "i2", "f2", "u8"])
-def test_what_a_store_puts_there_is_found_without_being_named(dtype: str, context: int) -> None:
+def test_what_a_store_puts_there_is_found_without_being_named(dtype: str, context: Any) -> None:
     """Flags far from all other values at both ends, and zeros in planes that nobody wrote."""
     values = field(dtype) + np.asarray(20, dtype)
     flags = {"i2": (-32768, -32767, 32767), "u8": (2**63,)}.get(dtype, (-60000, -59000, 60000))
@@ -266,7 +220,7 @@ def test_what_a_store_puts_there_is_found_without_being_named(dtype: str, contex
         assert error_of(found[kept], values[kept]) <= limit_of(quality, values[kept])
 
 
-def test_rows_are_written_one_after_the_other(context: int) -> None:
+def test_rows_are_written_one_after_the_other(context: Any) -> None:
     """A store decodes a chunk, and codes it with new rows: what is not there yet stays, and bounds
     are those of what is there."""
     values, fill = field("f4") - 50, np.float32(-999)
@@ -281,7 +235,7 @@ def test_rows_are_written_one_after_the_other(context: int) -> None:
             assert np.abs(chunk - values)[:, :, row].max() <= 0.01 * np.ptp(values[:, :, : row + 1])
 
 
-def test_many_nan_of_different_bits(context: int) -> None:
+def test_many_nan_of_different_bits(context: Any) -> None:
     """Every bit is asked for: each NaN keeps its own, also where they are too many to be named."""
     for count in (3, 400):
         values = field("f4", (2, 3, 20, 30)).ravel()
@@ -292,7 +246,7 @@ def test_many_nan_of_different_bits(context: int) -> None:
         assert found.tobytes() == values.tobytes()
 
 
-def test_missing_values_that_are_damaged(context: int) -> None:
+def test_missing_values_that_are_damaged(context: Any) -> None:
     values = field("f4")
     values[0, 0, 0, 0], values[0, 0, 0, 1] = np.inf, 1e9
     data = encode(context, values, max_error=0.1)[3]
@@ -308,11 +262,11 @@ def test_missing_values_that_are_damaged(context: int) -> None:
         assert decode(context, stream, tile_of(SHAPE, "f4"))[0] == STATUS["ERROR_DAMAGED"]
 
 
-def test_arguments_that_are_not_allowed(context: int) -> None:
+def test_arguments_that_are_not_allowed(context: Any) -> None:
     values, wrong = field("f4"), STATUS["ERROR_ARGUMENT"]
     shapes = ((0, 1, 1, 1), (1, 1, -1, 1), (1, 1 << 14, 1 << 14, 1))
     bad = [tile_of(shape, "f4") for shape in shapes]
-    bad += [Tile(bad[0].shape, kind) for kind in (0, 12, -1)]
+    bad += [ffi.new("fhash_tile *", (SHAPE, kind)) for kind in (0, 12, -1)]
     shared = tile_of(SHAPE, "f4", settings_of(values).to_bytes())
     for tile in (*bad, shared):
         assert encode(context, values, max_error=1.0, tile=tile)[0] == wrong
@@ -324,26 +278,25 @@ def test_arguments_that_are_not_allowed(context: int) -> None:
         {"step": -1.0},
         {"max_error": 1.0, "effort": 0},
         {"max_error": 1.0, "effort": 10},
-        {"max_error": 1.0, "transform_given": 1, "transform": (ctypes.c_uint8 * 4)(0, 0, 64, 0)},
-        {"max_error": 1.0, "transform_given": 1, "transform": (ctypes.c_uint8 * 4)(0, 0, 59, 0)},
+        {"max_error": 1.0, "transform_given": 1, "transform": (0, 0, 64, 0)},
+        {"max_error": 1.0, "transform_given": 1, "transform": (0, 0, 59, 0)},
     )
     for quality in qualities:
         assert encode(context, values, **quality)[0] == wrong
-    assert encode(None, values, max_error=1.0)[0] == wrong
+    assert encode(NULL, values, max_error=1.0)[0] == wrong
     data, tile = encode(context, values, max_error=1.0)[3], tile_of(SHAPE, "f4")
-    assert decode(None, data, tile)[0] == wrong
+    assert decode(NULL, data, tile)[0] == wrong
     assert [decode(context, data, tile, lod)[0] for lod in (-1, 11)] == [wrong, wrong]
     assert decode(context, data, tile, 1, mask=True)[0] == wrong
     for each in bad[:2]:
         assert decode(context, data, each)[0] == wrong
-    some, call = ctypes.create_string_buffer(1 << 12), LIBRARY.fhash_tile_decode
-    for of, stream, room in ((None, data, some), (tile, None, some), (tile, data, None)):
-        given = None if of is None else ctypes.byref(of)
-        assert call(context, given, stream, len(data), 0, room, None, None) == wrong
-    assert LIBRARY.fhash_tile_bound(None) == 0
+    some, call = ffi.new("char[]", 1 << 12), LIBRARY.fhash_tile_decode
+    for of, stream, room in ((NULL, data, some), (tile, NULL, some), (tile, data, NULL)):
+        assert call(context, of, stream, len(data), 0, room, NULL, NULL) == wrong
+    assert LIBRARY.fhash_tile_bound(NULL) == 0
 
 
-def test_room_that_is_too_small_is_told_with_the_size(context: int) -> None:
+def test_room_that_is_too_small_is_told_with_the_size(context: Any) -> None:
     values = field("f4")
     _, _, size, data = encode(context, values, max_error=0.1)
     for room in (0, size - 1):
@@ -364,7 +317,7 @@ def test_memory_is_limited_by_the_context() -> None:
         LIBRARY.fhash_context_destroy(each)
 
 
-def test_damage_is_told_or_gives_some_values(context: int) -> None:
+def test_damage_is_told_or_gives_some_values(context: Any) -> None:
     """Cut and flipped streams, under the checksum that they have and under the right one."""
     random, damaged = np.random.default_rng(0), STATUS["ERROR_DAMAGED"]
     qualities = {"f4": {"max_error": 0.1}, "i2": {"max_error": 0.0}, "f8": {"step": 9.0}}
@@ -383,7 +336,7 @@ def test_damage_is_told_or_gives_some_values(context: int) -> None:
             assert decode(context, stream, tile, turn % 2)[0] in (0, damaged)
 
 
-def test_two_threads_share_a_context(context: int) -> None:
+def test_two_threads_share_a_context(context: Any) -> None:
     """Settings and norms are made once, by whoever comes first."""
     several = [field(dtype, (1, 2, n, 12)) for n in (5, 8, 17) for dtype in ("f4", "f8", "i4")]
     alone = [encode(context, values, max_error=0.5)[3] for values in several]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,11 +14,9 @@ import pytest
 import tiles
 from numcodecs.zstd import compress, decompress
 from reference.kernels import (
-    State,
     blank_predicted_state,
     decode_predicted,
     encode_predicted,
-    state_arguments,
 )
 from reference.sections import (
     labelled_stream,
@@ -174,19 +171,6 @@ def test_integers_that_are_too_large_are_refused() -> None:
     counted = np.array([True, False, False, False]).reshape(1, 1, 1, 4)
     integers = integers_of(values, counted, predictor)
     np.testing.assert_array_equal(integers, np.zeros((1, 1, 1, 4)))
-
-
-def test_arguments_hold_the_arrays_that_they_point_to() -> None:
-    """Threads may build a state at the same time; nothing but the arguments holds all but one."""
-    arguments = state_arguments(
-        State(
-            slots=np.zeros((8, 4), np.uint16),
-            weights=np.zeros(8, np.int32),
-            simples=np.zeros((8, 2), np.uint16),
-        )
-    )
-    arrays = [argument._arr for argument in arguments if isinstance(argument, ctypes.c_void_p)]
-    assert [array.shape[0] for array in arrays] == [8, 8, 8]
 
 
 def test_threads_that_decode_for_the_first_time_at_once() -> None:

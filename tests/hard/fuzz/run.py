@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -134,7 +135,6 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     _require_sanitizers(compiler, folder)
     tracing, headers = ("-fsanitize-coverage=trace-pc",), f"-I{NATIVE}"
-    declared = f"-I{_declare(folder)}"
     jobs: list[tuple[Path, tuple[str, ...]]] = [(HERE / "driver.cpp", ("-fsanitize=address", "-g"))]
     if march:
         # Unused lanes of vectors may hold NaN, so float-cast-overflow would report them.
@@ -145,7 +145,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
             )
             for name in MARCH
         ]
-        jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}", declared))]
+        jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}"))]
     jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in SOURCES]
     jobs += [
         (path, ("-xc", "-std=gnu11", "-w", "-DZSTD_DISABLE_ASM=1", "-fsanitize=address", "-g"))
@@ -155,7 +155,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     jobs += [(CODEC / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in CODEC_SOURCES]
     jobs += [(NETWORK / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in NETWORK_SOURCES]
     jobs += [
-        (target, (*SANITIZE, declared, headers, *(["-DFHASH_FUZZ_MARCH"] if march else [])))
+        (target, (*SANITIZE, headers, *(["-DFHASH_FUZZ_MARCH"] if march else [])))
         for target in TARGETS
     ]
 
@@ -174,20 +174,13 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     return binary
 
 
-def native_sources() -> list[Path]:
-    """Return all files of the three libraries."""
-    return [path for folder in (NATIVE, CODEC, NETWORK) for path in sorted(folder.glob("*.cpp"))]
-
-
-def _declare(folder: Path) -> Path:
-    """Write the header of what the libraries export, which targets include; return its folder.
-
-    No target declares a function itself, so none can be called by another signature than its own.
-    """
-    from declarations import header
-
-    (folder / "exports.hpp").write_text(header(native_sources()), encoding="utf-8")
-    return folder
+def declared() -> dict[str, list[str]]:
+    """Return the functions of each file of the three libraries, as their headers name them."""
+    headers = (NATIVE / "functions.h", CODEC / "codec.h", NETWORK / "network.h")
+    text = "".join(header.read_text(encoding="utf-8") for header in headers)
+    _, *parts = re.split(r"/\* (\w+)\.cpp \*/", text)
+    files = zip(parts[::2], parts[1::2], strict=True)
+    return {file: re.findall(r"^\w.* \*?(fhash_\w+)\(", body, re.MULTILINE) for file, body in files}
 
 
 def _compile(command: list[str]) -> None:

@@ -16,15 +16,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import declarations
 import readers
 import run
-from reference import kernels
 from reporting import LONG
-
-from fhash_codec import native as codec
-from fhash_codec.native import network
-from fhash_formats import native as formats
 
 SECONDS = 5.0
 """Seconds for which the fuzzer mutates inputs, after it has run all seeds."""
@@ -34,7 +28,6 @@ seeds of one setup (2 and 15), so that all kinds of seeds take turns."""
 NOT_FUZZED = {
     **dict.fromkeys(("fhash_abi_version", "fhash_codec_abi_version"), "takes nothing"),
     "fhash_network_abi_version": "takes nothing",
-    "fhash_function": "takes a name of the caller",
     "fhash_between": "takes frames that Python or a file has decoded; files are fuzzed",
     "fhash_price": "takes coefficients of the planner, any floats",
     "fhash_plan": "takes the caller's own values, by arrays that Python alone makes",
@@ -85,46 +78,14 @@ def test_every_target_has_a_name_and_seeds(folder: Path) -> None:
     assert first == set(range(len(seeds.NAMES)))
 
 
-def test_declarations_are_of_all_that_python_calls() -> None:
-    """Functions behind a macro are declared, too, and with as many parameters."""
-    declared = declarations.exported(run.native_sources())
-    public = declarations.CALL.findall((run.NATIVE / "fhash.h").read_text(encoding="utf-8"))
-    for library in (formats, kernels, codec, network):
-        for name, arguments in library.PROTOTYPES.items():
-            if name in public:  # declared by that header
-                continue
-            parameters = [each for each in declared[name].split(",") if each]
-            assert len(parameters) == len(arguments), name
-            for parameter, argument in zip(parameters, arguments, strict=True):
-                assert ("*" in parameter) == (argument is formats.ARRAY), name
-
-
-def test_a_header_declares_what_stands_behind_macros(tmp_path: Path) -> None:
-    source = tmp_path / "some.cpp"
-    source.write_text(
-        "#define BOTH \\\n    const uint8_t* given, i64 size\n"
-        "#define EACH(NAME, T) \\\n    FHASH_EXPORT int64_t fhash_##NAME(T* to, \\\n"
-        "                                      BOTH) { return 0; }\n"
-        "EACH(one, float)\nEACH(two, FhashTask)  // FHASH_EXPORT int64_t fhash_three()\n",
-        encoding="utf-8",
-    )
-    assert declarations.header([source]).splitlines()[2:] == [
-        'extern "C" {',
-        "struct FhashTask;",
-        "std::int64_t fhash_one(float* to, const std::uint8_t* given, std::int64_t size);",
-        "std::int64_t fhash_two(FhashTask* to, const std::uint8_t* given, std::int64_t size);",
-        "}",
-    ]
-
-
 def test_every_exported_function_has_a_target_and_no_target_declares_one() -> None:
     called = set()
     for path in (*run.TARGETS, run.HERE / "target_march.cpp", run.HERE / "overrun.cpp"):
         text = path.read_text(encoding="utf-8")
         assert '#include "exports.hpp"' in text, path.name
         assert not re.search(r"int64_t fhash_", text), f"{path.name} declares a function itself"
-        called |= set(declarations.CALL.findall(text))
-    declared = set(declarations.exported(run.native_sources()))
+        called |= set(re.findall(r"\bfhash_\w+", text))
+    declared = {name for names in run.declared().values() for name in names}
     assert called & declared == declared - NOT_FUZZED.keys()
     assert set(NOT_FUZZED) <= declared
 
@@ -132,8 +93,8 @@ def test_every_exported_function_has_a_target_and_no_target_declares_one() -> No
 def test_every_file_that_is_called_is_built() -> None:
     """A file of a library that no list names has no function that a target calls."""
     built = {*run.SOURCES, *run.CODEC_SOURCES, *run.NETWORK_SOURCES, *run.MARCH}
-    others = [path for path in run.native_sources() if path.stem not in built]
-    assert set(declarations.exported(others)) <= NOT_FUZZED.keys()
+    others = [name for file, names in run.declared().items() if file not in built for name in names]
+    assert set(others) <= NOT_FUZZED.keys()
 
 
 @pytest.mark.hard

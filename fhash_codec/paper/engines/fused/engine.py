@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines.fused import program
+from fhash_codec.paper.engines.fused.declarations import ffi
 from fhash_codec.paper.engines.fused.program import (
     DeviceLimits,
     Sizes,
@@ -49,27 +49,6 @@ TRIAL_ERROR = 1e-3
 """Relative difference of the squared errors of a trial that is no more than rounding."""
 TRIAL_VALUE = 1e-4
 """Median difference of the values after a trial that is no more than rounding."""
-
-
-class ModelRecord(ctypes.Structure):
-    """The record `Model` of kernels/model.cuh."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("bricks", "mask", "values", "offsets", "rank")),
-        *((name, ctypes.c_void_p * 4) for name in ("start", "before", "after")),
-        *((name, ctypes.c_void_p) for name in ("powers", "weights")),
-        *((name, ctypes.c_void_p) for name in ("fine", "fine_mean", "fine_square", "visited")),
-        *((name, ctypes.c_void_p) for name in ("flat", "flat_mean", "flat_square", "gradient")),
-        ("fine_row", ctypes.c_longlong),
-        ("coarse", ctypes.c_longlong),
-        ("steps", ctypes.c_int),
-    )
-
-
-class RateRecord(ctypes.Structure):
-    """The record `Rate` of kernels/model.cuh."""
-
-    _fields_ = (("root", ctypes.c_float), ("pace", ctypes.c_float))
 
 
 STATE = ("fine", "fine_mean", "fine_square", "flat", "flat_mean", "flat_square")
@@ -163,7 +142,7 @@ class FusedEngine:
         ids = self._transferred(chosen)
         self.step += 1
         scale = 2.0 / max(int(self._counts[chosen].sum()), 1)
-        rate = RateRecord(*corrections(self.step, float(self.rates[self.step])))
+        rate = ffi.new("Rate *", corrections(self.step, float(self.rates[self.step])))
         # A batch of few bricks is cut into parts, so that all multiprocessors have work.
         parts = max(1, min(self._slots // len(chosen), self._sizes.tiles))
         items = len(chosen) * parts
@@ -173,7 +152,7 @@ class FusedEngine:
             shape = (items, self._sizes.lattice, 2)
             places = torch.empty(shape, dtype=torch.int32, device=self.device)
             entries = torch.empty(shape, device=self.device)
-        model, step = self._record, ctypes.c_longlong(self.step)
+        model, step = self._record, ffi.new("long long *", self.step)
         self._program.launch(
             "train_bricks",
             blocks,
@@ -181,10 +160,10 @@ class FusedEngine:
             [
                 model,
                 _pointer(ids),
-                ctypes.c_int(items),
-                ctypes.c_int(parts),
+                ffi.new("int *", items),
+                ffi.new("int *", parts),
                 step,
-                ctypes.c_float(scale),
+                ffi.new("float *", scale),
                 rate,
                 _pointer(self._matrix_gradients),
                 _pointer(self._errors),
@@ -201,11 +180,11 @@ class FusedEngine:
             [
                 model,
                 _pointer(ids),
-                ctypes.c_int(len(chosen)),
+                ffi.new("int *", len(chosen)),
                 step,
                 rate,
                 _pointer(self._matrix_gradients),
-                ctypes.c_int(blocks),
+                ffi.new("int *", blocks),
             ],
         )
         self.visited[chosen] = self.step
@@ -225,9 +204,9 @@ class FusedEngine:
                 [
                     self._record,
                     _pointer(ids),
-                    ctypes.c_int(len(chosen)),
+                    ffi.new("int *", len(chosen)),
                     _pointer(first),
-                    ctypes.c_longlong(self.step),
+                    ffi.new("long long *", self.step),
                     _pointer(values),
                 ],
             )
@@ -243,9 +222,9 @@ class FusedEngine:
             4 * (self._sizes.threads + 16),
             [
                 self._record,
-                ctypes.c_longlong(0),
-                ctypes.c_int(bricks),
-                ctypes.c_longlong(self.step),
+                ffi.new("long long *", 0),
+                ffi.new("int *", bricks),
+                ffi.new("long long *", self.step),
             ],
         )
         self.visited[self.visited > 0] = self.step
@@ -284,7 +263,7 @@ class FusedEngine:
         assert visited is not None
         visited.copy_(torch.from_numpy(self.visited))
 
-    def _add_in_order(self, model: ModelRecord, places: Tensor, entries: Tensor) -> None:
+    def _add_in_order(self, model: Any, places: Tensor, entries: Tensor) -> None:
         """Add coarse gradients, of each number in the order of the bricks.
 
         Args:
@@ -302,7 +281,7 @@ class FusedEngine:
                 _pointer(ordered),
                 _pointer(order),
                 _pointer(entries),
-                ctypes.c_longlong(len(order)),
+                ffi.new("long long *", len(order)),
             ],
         )
 
@@ -343,11 +322,10 @@ class FusedEngine:
             return tensor
         return tensor.pin_memory().to(self.device, non_blocking=True)
 
-    def _model(self) -> ModelRecord:
+    def _model(self) -> Any:
         """Return the arrays of the engine, whose memory never moves, as the kernels take them."""
         start, before, after = (
-            (ctypes.c_void_p * 4)(*(axis[table].data_ptr() for axis in self._axes))
-            for table in range(3)
+            [_address(axis[table]) for axis in self._axes] for table in range(3)
         )
         arrays = {
             **self._arrays,
@@ -355,23 +333,29 @@ class FusedEngine:
             "weights": self._missed[1],
             **{name: getattr(self, name) for name in (*STATE, "gradient")},
         }
-        return ModelRecord(
+        record = dict(
             start=start,
             before=before,
             after=after,
             fine_row=self.fine.stride(0),
             coarse=self.coarse,
             steps=len(self.rates),
-            **{name: _pointer(array) for name, array in arrays.items()},
+            **{name: _address(array) for name, array in arrays.items()},
         )
+        return ffi.new("Model *", record)
 
 
-def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+def _address(tensor: Tensor | None) -> Any:
     """Return the address of a tensor's numbers, null for none."""
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+    return ffi.cast("void *", 0 if tensor is None else tensor.data_ptr())
 
 
-FILES = ("network.cuh", "points.cu")
+def _pointer(tensor: Tensor | None) -> Any:
+    """Return the address of a tensor's numbers as an argument of a kernel."""
+    return ffi.new("void **", _address(tensor))
+
+
+FILES = ("records.h", "network.cuh", "points.cu")
 """The files of the kernels in the order in which they follow each other."""
 MAX_BLOCKS = 8
 """Blocks at most for each multiprocessor."""
@@ -399,17 +383,6 @@ class PointSizes(Sizes):
         """Yield the lines that define the constants."""
         yield from self.layer_constants()
         yield f"constexpr bool SPARSE = {str(self.sparse).lower()};"
-
-
-class LevelRecord(ctypes.Structure):
-    """The record `Level` of kernels/points.cu."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("table", "words", "blocks", "within")),
-        ("nothing", ctypes.c_longlong),
-        ("strides", ctypes.c_longlong * 3),
-        ("scale", ctypes.c_double * 3),
-    )
 
 
 class DeviceTables:
@@ -455,16 +428,17 @@ def nodes_of(network: Network, key: float) -> tuple[list[range], list[float]]:
     return [nodes for nodes, _ in found], [share for _, share in found]
 
 
-def _record(patch: Patch, resolution: Resolution, bits: Mapping[str, Tensor]) -> LevelRecord:
+def _record(patch: Patch, resolution: Resolution, bits: Mapping[str, Tensor]) -> Any:
     """Return the record of a level's part without its table; `bits` are those of a sparse one."""
     axes = list(zip(resolution, patch.strides, strict=True))[:0:-1]
-    return LevelRecord(
+    record = dict(
         nothing=patch.bits.count if isinstance(patch, SparsePatch) else 0,
         # An axis of one vertex has no corner after it: both corners are the same.
-        strides=(ctypes.c_longlong * 3)(*(step if size > 1 else 0 for size, step in axes)),
-        scale=(ctypes.c_double * 3)(*(size - 1 for size, _ in axes)),
-        **{name: tensor.data_ptr() for name, tensor in bits.items()},
+        strides=[step if size > 1 else 0 for size, step in axes],
+        scale=[size - 1 for size, _ in axes],
+        **{name: _address(tensor) for name, tensor in bits.items()},
     )
+    return ffi.new("Level *", record)
 
 
 def _sent(array: npt.NDArray[Any], device: torch.device) -> Tensor:
@@ -510,17 +484,6 @@ class PointKernels:
             self._tables = None
 
 
-class PlacesRecord(ctypes.Structure):
-    """The record `Places` of kernels/points.cu."""
-
-    _fields_ = (
-        ("at", ctypes.c_void_p),
-        ("count", ctypes.c_longlong),
-        ("span", ctypes.c_double * 3),
-        ("inverse", ctypes.c_double * 3),
-    )
-
-
 class FusedPoints:
     """A network at one time on a device."""
 
@@ -548,12 +511,12 @@ class FusedPoints:
         self._spans = [float(max(size - 1, 1)) for size in reversed(network.box_size)]
         tables = kernels.tables(network, key, device)
         values = tables.at(nodes_of(network, key)[1])
-        records = (LevelRecord * len(values))(*tables.records)
+        records = ffi.new("Level[]", [record[0] for record in tables.records])
         for record, table in zip(records, values, strict=True):
-            record.table = table.data_ptr()
+            record.table = _address(table)
         # The records hold addresses of these tensors.
         self._held = tables, values
-        self._levels = _sent(np.frombuffer(bytes(records), np.uint8), device)
+        self._levels = _sent(np.frombuffer(ffi.buffer(records), np.uint8), device)
         self._layers = _sent(
             np.concatenate([np.column_stack(layer).reshape(-1) for layer in network.layers]), device
         )
@@ -592,22 +555,18 @@ class FusedPoints:
         assert places.shape[1:] == (3,)
         places = places.contiguous()
         results = torch.empty(shape, dtype=torch.float32, device=self._device)
-        record = PlacesRecord(
-            at=places.data_ptr(),
-            count=len(places),
-            span=(ctypes.c_double * 3)(*self._spans),
-            inverse=(ctypes.c_double * 3)(*(1.0 / span for span in self._spans)),
-        )
+        inverse = [1.0 / span for span in self._spans]
+        record = ffi.new("Places *", (_address(places), len(places), self._spans, inverse))
         tiles = -(-len(places) // self._sizes.columns)
         self._program.launch(
             kernel,
             max(1, min(tiles, self._slots)),
             self._sizes.shared_bytes,
             [
-                ctypes.c_void_p(self._levels.data_ptr()),
-                ctypes.c_void_p(self._layers.data_ptr()),
+                _pointer(self._levels),
+                _pointer(self._layers),
                 record,
-                ctypes.c_void_p(results.data_ptr()),
+                _pointer(results),
             ],
         )
         return results

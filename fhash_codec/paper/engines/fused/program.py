@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import importlib.util
 import os
@@ -21,6 +20,7 @@ import numpy.typing as npt
 import torch
 
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.engines.fused.declarations import ffi
 from fhash_codec.paper.engines.parameters import BETA1, BETA2, WINDOW, axis_matrices
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import FhashError
@@ -98,7 +98,7 @@ def missed_step_tables(
 
 KERNELS = Path(__file__).parent / "kernels"
 """Folder of the kernels' files."""
-FILES = ("model.cuh", "network.cuh", "brick.cuh", "bricks.cu")
+FILES = ("records.h", "model.cuh", "network.cuh", "brick.cuh", "bricks.cu")
 """The files in the order in which they follow each other."""
 THREADS = 256
 """Threads of a block."""
@@ -409,22 +409,22 @@ class Nvrtc:
         self.path = path
         # NVRTC loads its other library by name, which finds it only where it is loaded already.
         for other in sorted(path.parent.glob("libnvrtc-builtins.so*")):
-            ctypes.CDLL(str(other))
-        self._library = ctypes.CDLL(str(path))
+            _opened(str(other))
+        self._library = _opened(str(path))
 
     @cached_property
     def version(self) -> tuple[int, int]:
         """The version, major and minor."""
-        major, minor = ctypes.c_int(), ctypes.c_int()
-        self._call("nvrtcVersion", ctypes.byref(major), ctypes.byref(minor))
-        return major.value, minor.value
+        major, minor = ffi.new("int *"), ffi.new("int *")
+        self._call("nvrtcVersion", major, minor)
+        return major[0], minor[0]
 
     @cached_property
     def architectures(self) -> list[int]:
         """The architectures that it compiles for, as in 90 for sm_90."""
-        count = ctypes.c_int()
-        self._call("nvrtcGetNumSupportedArchs", ctypes.byref(count))
-        numbers = (ctypes.c_int * count.value)()
+        count = ffi.new("int *")
+        self._call("nvrtcGetNumSupportedArchs", count)
+        numbers = ffi.new("int[]", count[0])
         self._call("nvrtcGetSupportedArchs", numbers)
         return list(numbers)
 
@@ -441,27 +441,27 @@ class Nvrtc:
         Raises:
             Unavailable: the text cannot be compiled.
         """
-        program = ctypes.c_void_p()
-        name = b"fhash.cu"
-        self._call("nvrtcCreateProgram", ctypes.byref(program), text.encode(), name, 0, None, None)
+        program = ffi.new("nvrtcProgram *")
+        files = (text.encode(), b"fhash.cu", 0, ffi.NULL, ffi.NULL)
+        self._call("nvrtcCreateProgram", program, *files)
         try:
             options = [f"--gpu-architecture=sm_{architecture}", *OPTIONS]
-            array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
-            answer = self._library.nvrtcCompileProgram(program, len(options), array)
-            log = self._bytes(program, "ProgramLog").rstrip(b"\0").decode(errors="replace")
+            array = [ffi.new("char[]", option.encode()) for option in options]
+            answer = self._library.nvrtcCompileProgram(program[0], len(options), array)
+            log = self._bytes(program[0], "ProgramLog").rstrip(b"\0").decode(errors="replace")
             if answer:
                 raise Unavailable(f"NVRTC {self._error(answer)}:\n{log}")
-            return self._bytes(program, "CUBIN"), log
+            return self._bytes(program[0], "CUBIN"), log
         finally:
-            self._library.nvrtcDestroyProgram(ctypes.byref(program))
+            self._library.nvrtcDestroyProgram(program)
 
-    def _bytes(self, program: ctypes.c_void_p, name: str) -> bytes:
+    def _bytes(self, program: Any, name: str) -> bytes:
         """Return what nvrtcGetNAME has for a program."""
-        size = ctypes.c_size_t()
-        self._call(f"nvrtcGet{name}Size", program, ctypes.byref(size))
-        data = ctypes.create_string_buffer(size.value)
+        size = ffi.new("size_t *")
+        self._call(f"nvrtcGet{name}Size", program, size)
+        data = ffi.new("char[]", size[0])
         self._call(f"nvrtcGet{name}", program, data)
-        return data.raw
+        return bytes(ffi.buffer(data))
 
     def _call(self, name: str, *arguments: Any) -> None:
         """Call a function; Unavailable where it fails or the library is too old to have it."""
@@ -472,9 +472,7 @@ class Nvrtc:
             raise Unavailable(f"NVRTC {self._error(answer)}")
 
     def _error(self, answer: int) -> str:
-        text = self._library.nvrtcGetErrorString
-        text.restype = ctypes.c_char_p
-        return str(text(answer).decode())
+        return str(ffi.string(self._library.nvrtcGetErrorString(answer)).decode())
 
 
 def find_nvrtc() -> Nvrtc:
@@ -540,7 +538,7 @@ class Driver:
     def __init__(self) -> None:
         """Load and initialise the library."""
         self._library = _loaded(LIBRARIES)
-        self.call("cuInit", ctypes.c_uint(0))
+        self.call("cuInit", 0)
 
     def call(self, name: str, *arguments: Any) -> None:
         """Call a function of the library."""
@@ -548,16 +546,16 @@ class Driver:
         if function is None:
             raise Unavailable(f"the CUDA driver is too old: it has no {name}")
         if answer := function(*arguments):
-            text = ctypes.c_char_p()
-            self._library.cuGetErrorString(answer, ctypes.byref(text))
-            reason = text.value.decode() if text.value else f"error {answer}"
+            text = ffi.new("char **")
+            self._library.cuGetErrorString(answer, text)
+            reason = ffi.string(text[0]).decode() if text[0] else f"error {answer}"
             raise Unavailable(f"{name} of the CUDA driver failed: {reason}")
 
     def attribute(self, device: int, number: int) -> int:
         """Return an attribute of a device."""
-        value = ctypes.c_int()
-        self.call("cuDeviceGetAttribute", ctypes.byref(value), number, device)
-        return value.value
+        value = ffi.new("int *")
+        self.call("cuDeviceGetAttribute", value, number, device)
+        return int(value[0])
 
 
 class CudaProgram:
@@ -573,14 +571,15 @@ class CudaProgram:
         """Load a module into the device's primary context; `cached` is its file, if it is new."""
         self._driver, self._device, self._threads = driver, device, threads
         self._cached, self.new = cached, cached is not None
-        self._module = ctypes.c_void_p()
-        self._kernels: dict[tuple[str, int], ctypes.c_void_p] = {}
-        self._in_context(driver.call, "cuModuleLoadData", ctypes.byref(self._module), cubin)
+        self._module = ffi.new("CUmodule *")
+        self._kernels: dict[tuple[str, int], Any] = {}
+        self._in_context(driver.call, "cuModuleLoadData", self._module, cubin)
 
-    def launch(
-        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[ctypes._CDataType]
-    ) -> None:
-        """Launch a kernel after the work that torch has queued; Unavailable where that fails."""
+    def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
+        """Launch a kernel after the work that torch has queued; Unavailable where that fails.
+
+        arguments: pointers to them.
+        """
         self._in_context(self._launch, kernel, blocks, shared_bytes, arguments)
 
     def forget(self) -> None:
@@ -589,27 +588,26 @@ class CudaProgram:
             self._cached.unlink(missing_ok=True)
 
     def _launch(
-        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[ctypes._CDataType]
+        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]
     ) -> None:
         """Do what `launch` does, in the device's context."""
-        addresses = (ctypes.c_void_p * len(arguments))(*map(ctypes.addressof, arguments))
         self._driver.call(
             "cuLaunchKernel",
             self._kernel(kernel, shared_bytes),
-            *map(ctypes.c_uint, (blocks, 1, 1, self._threads, 1, 1, shared_bytes)),
-            ctypes.c_void_p(torch.cuda.current_stream(self._device).cuda_stream),
-            addresses,
-            None,
+            *(blocks, 1, 1, self._threads, 1, 1, shared_bytes),
+            ffi.cast("CUstream", torch.cuda.current_stream(self._device).cuda_stream),
+            list(arguments),
+            ffi.NULL,
         )
 
-    def _kernel(self, name: str, shared_bytes: int) -> ctypes.c_void_p:
+    def _kernel(self, name: str, shared_bytes: int) -> Any:
         """Return a kernel that may have some bytes of shared memory."""
         kernel = self._kernels.get((name, shared_bytes))
         if kernel is None:
-            kernel = ctypes.c_void_p()
-            call = self._driver.call
-            call("cuModuleGetFunction", ctypes.byref(kernel), self._module, name.encode())
-            call("cuFuncSetAttribute", kernel, DYNAMIC_SHARED, ctypes.c_int(shared_bytes))
+            found, call = ffi.new("CUfunction *"), self._driver.call
+            call("cuModuleGetFunction", found, self._module[0], name.encode())
+            kernel = found[0]
+            call("cuFuncSetAttribute", kernel, DYNAMIC_SHARED, shared_bytes)
             self._kernels[name, shared_bytes] = kernel
         return kernel
 
@@ -710,11 +708,17 @@ def cache_folder() -> Path:
 
 
 @cache
-def _loaded(names: Sequence[str]) -> ctypes.CDLL:
+def _loaded(names: Sequence[str]) -> Any:
     """Return the first library of some names that loads; Unavailable where none does."""
     for name in names:
         try:
-            return ctypes.CDLL(name)
+            return _opened(name)
         except OSError:
             continue
     raise Unavailable(f"the CUDA driver's library is not here ({' or '.join(names)})")
+
+
+@cache
+def _opened(name: str) -> Any:
+    """Return a library, which stays loaded; OSError where it does not load."""
+    return ffi.dlopen(name)

@@ -3,7 +3,8 @@
 #include <algorithm>
 #include <cstring>
 
-#include "arrays.hpp"
+#include "chunks.hpp"
+#include "functions.h"
 
 using namespace fhash;
 
@@ -66,6 +67,7 @@ bool check_pieces(const fhash_file& file, const Member& member, fhash_error& err
 
 }  // namespace
 
+// A further handle of an open file, which reads with another context. Each is closed on its own.
 int32_t fhash_file_with(fhash_context* context, const fhash_file* file, fhash_file** made,
                         fhash_error* error) {
     return reported(error, [&](fhash_error&) {
@@ -74,6 +76,7 @@ int32_t fhash_file_with(fhash_context* context, const fhash_file* file, fhash_fi
     });
 }
 
+// Node `number`, from 0, in the order of the file; 1, or 0 where there is none.
 int32_t fhash_file_node(const fhash_file* file, int64_t number, fhash_node* node) {
     const Opened& opened = *file->opened;
     if (number < 0 || number >= int64_t(opened.hierarchy.nodes.size())) return 0;
@@ -95,6 +98,7 @@ int32_t fhash_file_node(const fhash_file* file, int64_t number, fhash_node* node
     return 1;
 }
 
+// Array `number`, from 0, of a variable: its name there; 1, or 0 where there is none.
 int32_t fhash_file_place(const fhash_file* file, int32_t variable, int64_t number,
                          const char** name, int64_t* array) {
     if (variable < 0 || size_t(variable) >= file->variables.size()) return 0;
@@ -106,17 +110,21 @@ int32_t fhash_file_place(const fhash_file* file, int32_t variable, int64_t numbe
     return 1;
 }
 
-int32_t fhash_file_digest(const fhash_file* file, char digest[65]) {
+// SHA-256 of the directory as 64 hexadecimal digits and a zero byte.
+int32_t fhash_file_digest(const fhash_file* file, char* digest) {
     std::memcpy(digest, file->opened->directory.digest, 65);
     return 0;
 }
 
+// Sets the bytes of decoded chunks that are kept.
 int32_t fhash_file_cache(const fhash_file* file, uint64_t bytes) {
     Guard guard(file->cache.lock);
     file->cache.limit = bytes;
     return 0;
 }
 
+// The values of a region, [first, last) along each axis, and which are occupied; either may be
+// null. `keep`: whether the cache keeps the chunks.
 int32_t fhash_array_read(fhash_file* file, int64_t number, const int64_t* bounds, int32_t keep,
                          void* values, uint8_t* mask, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -129,6 +137,7 @@ int32_t fhash_array_read(fhash_file* file, int64_t number, const int64_t* bounds
     });
 }
 
+// A full chunk, padding included, at a level of detail.
 int32_t fhash_array_chunk(fhash_file* file, int64_t number, const int64_t* place, int32_t lod,
                           int32_t keep, fhash_chunk* chunk, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -149,8 +158,9 @@ int32_t fhash_array_chunk(fhash_file* file, int64_t number, const int64_t* place
 
 void fhash_chunk_free(void* owner) { delete static_cast<ChunkPointer*>(owner); }
 
+// Where the bytes of a chunk lie, offset and length, and the member that holds them.
 int32_t fhash_array_stored(fhash_file* file, int64_t number, const int64_t* place,
-                           uint64_t range[2], const char** member, fhash_error* error) {
+                           uint64_t* range, const char** member, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         const Array* const array = array_of(file, number, failed);
         std::vector<Stored> found;
@@ -163,6 +173,7 @@ int32_t fhash_array_stored(fhash_file* file, int64_t number, const int64_t* plac
     });
 }
 
+// Announces the bytes of the chunks of a region.
 int32_t fhash_array_announce(fhash_file* file, int64_t number, const int64_t* bounds,
                              fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
@@ -179,6 +190,7 @@ int32_t fhash_array_announce(fhash_file* file, int64_t number, const int64_t* bo
     });
 }
 
+// Checks the members of an array by their checksums.
 int32_t fhash_array_check(fhash_file* file, int64_t number, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         const Array* const array = array_of(file, number, failed);

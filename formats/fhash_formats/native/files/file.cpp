@@ -4,7 +4,6 @@
 #include <cstring>
 #include <new>
 
-#include "arrays.hpp"
 #include "volume.hpp"
 
 #if defined(_WIN32)
@@ -115,8 +114,10 @@ bool read_positions(fhash_file& file, const Variable& variable, int axis, double
 
 using namespace fhash;
 
-int32_t fhash_file_open(fhash_context* context, fhash_read_function read, Announce announce,
-                        void* user, uint64_t size, fhash_file** file, fhash_error* error) {
+// fhash_open with a function that is told what will be read; null for none.
+int32_t fhash_file_open(fhash_context* context, fhash_read_function read,
+                        fhash_announce_function announce, void* user, uint64_t size,
+                        fhash_file** file, fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         if (!context || !read || !file)
             return fail(failed, FHASH_ERROR_ARGUMENT, "a context, a function and a place for the "

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +13,9 @@ pytestmark = pytest.mark.torch
 from engine_checks import assert_near
 from readable_paper import NaiveEngine
 
-from fhash_codec.native import network
 from fhash_codec.native.network import PATHS, machine_paths
-from fhash_codec.paper.engines import make_engine, native
-from fhash_codec.paper.engines.native import Bricks, Gaps, Level, NativeEngine, refusal
+from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.engines.native import NativeEngine, refusal
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import at_most
@@ -197,29 +194,6 @@ def test_what_it_does_not_take_is_named(model_of) -> None:
         make_engine("native", architecture, coreset, RATES, seed=7, device="cuda")
     with pytest.raises(InputError, match="path is 'quick'"):
         NativeEngine(architecture, coreset, RATES, seed=7, path="quick")
-
-
-HEADER = (Path(network.__file__).parent / "bricks.hpp").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("structure", [Level, Gaps, Bricks])
-def test_structures_have_the_fields_of_the_header_in_its_order(structure) -> None:
-    text = re.search(rf"struct Fhash{structure.__name__} {{(.*?)\n}};", HEADER, re.DOTALL)
-    assert text is not None
-    names = []
-    for line in text.group(1).splitlines():
-        declared = line.split("//")[0].strip()
-        if declared:
-            words = re.sub(r"\[\d\]|[*;]", " ", declared.split(" ", 1)[1].replace("const ", ""))
-            names += [word.split()[-1] for word in words.split(",")]
-    assert names == [name for name, _ in structure._fields_]
-
-
-@pytest.mark.parametrize("name", ["GROUP", "REACH", "BLOCK", "WIDEST"])
-def test_constants_are_those_of_the_header(name) -> None:
-    value = re.search(rf"FHASH_{name} = (\d+);", HEADER)
-    assert value is not None
-    assert int(value.group(1)) == getattr(native, name)
 
 
 def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(model_of) -> None:

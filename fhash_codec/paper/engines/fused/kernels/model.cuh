@@ -24,40 +24,6 @@ constexpr float LOG_BETA1 = -0.10536051565782628f;
 constexpr float LOG_BETA2 = -0.0010005003335835335f;
 constexpr int WINDOW = 200;  // steps without a gradient after which a parameter stands still
 
-// The arrays of an engine; engine.py holds the same record. A table of an axis (t, z, y, x) holds,
-// for each coordinate of a brick and each coarse level, where the brick's sub-lattice begins, and
-// for each of its vertices the corner before it and the weight of the corner after it.
-struct Model {
-    const long long* bricks;          // (bricks, 4)
-    const unsigned char* mask;        // (bricks, MASK_BYTES), as np.packbits
-    const float* values;              // (samples,)
-    const long long* offsets;         // (bricks + 1,)
-    const int* rank;                  // place of a coarse number among those in use, or null
-    const int* start[4];              // (coordinates, COARSE)
-    const int* before[4];             // (coordinates, COARSE, vertices)
-    const float* after[4];            // (coordinates, COARSE, vertices)
-    const float* powers;              // (WINDOW + 1, 2), of the decays of a step without gradient
-    const float* weights;             // (steps, 2), see `catch_up`
-    float* fine;                      // (SIZE, fine_row): at the samples, brick by brick
-    float* fine_mean;
-    float* fine_square;
-    long long* visited;               // (bricks,)
-    float* flat;                      // coarse numbers in use, then the layers
-    float* flat_mean;
-    float* flat_square;
-    float* gradient;                  // of the coarse numbers
-    long long fine_row;               // numbers from one row of `fine` to the next
-    long long coarse;                 // number of coarse numbers
-    int steps;                        // length of `weights`
-};
-
-// Adam's numbers of one step, `corrections` in paper/engines/parameters.py: the factor of the mean square's
-// root, and the pace.
-struct Rate {
-    float root;
-    float pace;
-};
-
 __device__ inline void adam(
     float& number, float gradient, float& mean, float& square, const Rate& rate) {
     mean += REST1 * (gradient - mean);

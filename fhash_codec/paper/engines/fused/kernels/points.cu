@@ -10,28 +10,6 @@ constexpr int STEP = SIZE % 4 == 0 ? 4 : SIZE % 2 == 0 ? 2 : 1;  // numbers that
 
 static_assert(THREADS % COLUMNS == 0, "the threads of a column are whole shares");
 
-// The table of a level at one time; points.py holds the same record. Axes are x, y and z. Strides
-// count vertices, or bits of the bitmap where the level holds some vertices only
-// (paper/network.py); an axis of one vertex has the stride 0, which makes both corners the
-// same.
-struct Level {
-    const float* table;               // (vertices, SIZE)
-    const unsigned long long* words;  // the bitmap
-    const unsigned* blocks;           // ones before each block of 4 words
-    const unsigned char* within;      // ones before a word in its block
-    long long nothing;                // place of the embedding of vertices that are not held
-    long long strides[3];
-    double scale[3];                  // vertices of the level after the first one
-};
-
-// Places; points.py holds the same record.
-struct Places {
-    const double* at;   // (count, 3): x, y, z in vertices of the box
-    long long count;
-    double span[3];     // vertices of the box after the first one, at least 1
-    double inverse[3];  // 1 / span
-};
-
 struct alignas(4 * STEP) Some {
     float at[STEP];
 };

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 import subprocess
 from collections.abc import Callable, Sequence
@@ -10,10 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cffi
+
 from fhash_codec.paper.engines.fused.program import DeviceLimits, Sizes, Unavailable
 from fhash_codec.paper.network import ArrayTable, SparseFrame
 
 HERE = Path(__file__).parent
+FFI = cffi.FFI()
+FFI.cdef("int launch(const char* name, unsigned blocks, size_t bytes, int order, void** given);")
 LIMITS = DeviceLimits(
     multiprocessors=2,
     shared_per_block=160 << 10,
@@ -32,25 +35,15 @@ class EmulatedProgram:
     new = False
 
     def __init__(self, library: Path, order: int) -> None:
-        self.library = ctypes.CDLL(str(library))
-        self._launch = self.library.launch
-        self._launch.argtypes = [
-            ctypes.c_char_p,
-            ctypes.c_uint,
-            ctypes.c_size_t,
-            ctypes.c_int,
-            ctypes.c_void_p,
-        ]
+        self.library = FFI.dlopen(str(library))
         self.order = order
         self.launched: list[str] = []
         self.forgotten = False
 
-    def launch(
-        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[ctypes._CDataType]
-    ) -> None:
+    def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
         self.launched.append(kernel)
-        addresses = (ctypes.c_void_p * len(arguments))(*map(ctypes.addressof, arguments))
-        answer = self._launch(kernel.encode(), blocks, shared_bytes, self.order, addresses)
+        given = (kernel.encode(), blocks, shared_bytes, self.order, list(arguments))
+        answer = self.library.launch(*given)
         if answer:
             raise Unavailable(f"{kernel}: {FAILURES[answer]}")
 

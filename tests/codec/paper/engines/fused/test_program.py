@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +13,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
+
+from fhash_codec.paper.engines.fused.declarations import ffi
 
 from fhash_codec.paper.engines.fused import engine as points
 from fhash_codec.paper.engines.fused import program as driver_module
@@ -89,6 +90,9 @@ class FakeNvrtc:
         return b"code of " + text.encode(), ""
 
 
+REASON = ffi.new("char[]", b"a reason")
+
+
 class FakeLibrary:
     """A driver's library that notes its calls, and fails where `failing` says so."""
 
@@ -100,9 +104,9 @@ class FakeLibrary:
         def call(*arguments):
             self.calls.append((name, *arguments))
             if name == "cuGetErrorString":
-                arguments[1]._obj.value = b"a reason"
+                arguments[1][0] = REASON
             if name == "cuDeviceGetAttribute":
-                arguments[0]._obj.value = arguments[1]
+                arguments[0][0] = arguments[1]
             return int(name == self.failing)
 
         return call
@@ -191,7 +195,7 @@ def test_a_launch_passes_addresses_of_arguments_and_torchs_stream(library_of, tm
     file.write_bytes(b"code")
     program = CudaProgram(Driver(), b"code", torch.device("cuda", 0), 256, file)
     assert program.new
-    arguments = [ctypes.c_int(5), ctypes.c_float(2.5)]
+    arguments = [ffi.new("int *", 5), ffi.new("float *", 2.5)]
     program.launch("train_bricks", 12, 70_000, arguments)
     program.launch("train_bricks", 12, 70_000, arguments)
     names = [name for name, *_ in library.calls]
@@ -204,13 +208,13 @@ def test_a_launch_passes_addresses_of_arguments_and_torchs_stream(library_of, tm
         "cuLaunchKernel",
     ]
     assert library.calls[3][2] == 8
-    assert library.calls[3][3].value == 70_000
+    assert library.calls[3][3] == 70_000
     _, _, *numbers, stream, addresses, extra = library.calls[-1]
-    assert [number.value for number in numbers] == [12, 1, 1, 256, 1, 1, 70_000]
-    assert stream.value == 77
-    assert extra is None
-    assert ctypes.cast(addresses[0], ctypes.POINTER(ctypes.c_int))[0] == 5
-    assert ctypes.cast(addresses[1], ctypes.POINTER(ctypes.c_float))[0] == 2.5
+    assert list(numbers) == [12, 1, 1, 256, 1, 1, 70_000]
+    assert int(ffi.cast("intptr_t", stream)) == 77
+    assert not extra
+    assert addresses[0][0] == 5
+    assert addresses[1][0] == 2.5
     program.forget()
     assert not file.exists()
 
