@@ -176,7 +176,8 @@ class NativeFile:
 
     def nodes(self) -> list[Node]:
         """The groups and arrays, in the order of the file."""
-        found, listed = ffi.new("fhash_node *"), []
+        found = ffi.new("fhash_node *")
+        listed: list[Node] = []
         with self._using() as handle:
             while native.library().fhash_file_node(handle, len(listed), found):
                 listed.append(_node(found))
