@@ -218,13 +218,13 @@ def test_a_small_part_of_a_tile_comes_without_the_rest_and_the_rest_later(
         codecs=transform_codecs(settings),
     )
     asked: list[str] = []
-    real = decoding._call
+    real = decoding.call
 
     def call(name, *arguments):
         asked.append(name)
         return real(name, *arguments)
 
-    monkeypatch.setattr(decoding, "_call", call)
+    monkeypatch.setattr(decoding, "call", call)
     part = (slice(1, 2), slice(0, 2), slice(3, 5), slice(9, 11))
     with Container.open(path) as container:
         array = container.arrays[NAME]
