@@ -14,10 +14,9 @@ import pytest
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
-from fhash_codec.paper.engines.fused.declarations import ffi
-
 from fhash_codec.paper.engines.fused import engine as points
 from fhash_codec.paper.engines.fused import program as driver_module
+from fhash_codec.paper.engines.fused.declarations import ffi
 from fhash_codec.paper.engines.fused.engine import point_sizes
 from fhash_codec.paper.engines.fused.program import (
     FILES,
