@@ -239,8 +239,8 @@ class EncodeConfig(Record):
     )
     seed: int = limits(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = limits(
-        True,
-        "store seconds with the training history; "
+        False,
+        "keep the date, seconds and the course of a training in the file; "
         "without, the same input and number of threads give the same bytes",
     )
 
@@ -344,6 +344,13 @@ class EncodeConfig(Record):
             for name, value in vars(self).items()
             if name != "deterministic" or value
         }
+
+    def settings(self) -> dict[str, Any]:
+        """The settings that the preset has, as `to_dict` gives them: `config` of a header."""
+        values = self.to_dict()
+        of_preset = (None, self.published)
+        has = {f.name for f in dataclasses.fields(self) if f.metadata.get("published") in of_preset}
+        return {name: value for name, value in values.items() if name in has}
 
     def _accept_python_values(self) -> None:
         """Turn a single feature into a tuple, and key frames given as numbers into text."""

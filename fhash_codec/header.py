@@ -505,19 +505,19 @@ def brief_quality(
 
 
 def brief_history(
-    history: Sequence[Mapping[str, float | None]], *, timings: bool, most: int = MAX_POINTS
+    history: Sequence[Mapping[str, float | None]], most: int = MAX_POINTS
 ) -> dict[str, list[float | None]]:
     """A training history as a header has it: lists by name, of at most so many points.
 
     The last point is one of them. Seconds are rounded to milliseconds, PSNR to hundredths of a dB.
     Figures without a finite value, such as the PSNR of exact values, are None; a list of such
-    figures alone is left out. timings: keep the seconds.
+    figures alone is left out.
     """
     count = min(len(history), most)
     chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
     lists: dict[str, list[float | None]] = {
         "epoch": [point["epoch"] for point in chosen],
-        "seconds": [_rounded(point["seconds"], 3) if timings else None for point in chosen],
+        "seconds": [_rounded(point["seconds"], 3) for point in chosen],
         "psnr": [_rounded(point["psnr"], 2) for point in chosen],
     }
     return {

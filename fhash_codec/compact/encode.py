@@ -698,11 +698,11 @@ def table_header(
             **({} if tiling is None else {"tiling": tiling}),
             **between,
         },
-        "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
+        "config": config.settings() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": None if table.bulk is None else {"range": list(table.bulk.ends)}},
         "training": training_header(table.plan, config),
-        "history": brief_history(kept, timings=config.timings, most=HEAD_POINTS),
+        "history": brief_history(kept, HEAD_POINTS) if config.timings else {},
     }
 
 

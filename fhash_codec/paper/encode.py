@@ -361,7 +361,7 @@ def _header(
             "parameters": architecture.parameters_of(vertices),
             **({SPARSE: kept} if sparse_tables(coreset, config) else {}),
         },
-        "config": config.to_dict(),
+        "config": config.settings(),
         "training": {
             "seconds": seconds if config.timings else None,
             "steps": trained.steps,
@@ -370,5 +370,5 @@ def _header(
             **trained.engine,
             **restarts,
         },
-        "history": brief_history(trained.history, timings=config.timings),
+        "history": brief_history(trained.history) if config.timings else {},
     }

@@ -282,9 +282,7 @@ class _Fitting:
     def run(self) -> TrainedModel:
         """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
         leave_threads_of_parent()
-        # With --no-timings the same input gives the same file, on CUDA, too.
-        wanted = self._config.deterministic or not self._config.timings
-        with enough_memory(self._device), same_bits(self._device, wanted):
+        with enough_memory(self._device), same_bits(self._device, self._config.deterministic):
             return self._run()
 
     def _run(self) -> TrainedModel:

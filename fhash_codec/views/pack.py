@@ -321,7 +321,7 @@ def pack(
     axes: Sequence[str] | None = None,
     select: Mapping[str, int | str] | None = None,
     absent: str = ABSENT[0],
-    timings: bool = True,
+    timings: bool = False,
     force: bool = False,
     progress: Progress = silent,
 ) -> PackReport:
@@ -506,7 +506,7 @@ def _header(
             "parameters": weights,
             "head": head,
         },
-        "config": {**config.to_dict(), **bound},
+        "config": {**config.settings(), **bound},
         "quality": {},
         "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
         "history": {},

@@ -343,45 +343,11 @@ MAX_PARAMETERS = 1 << 62
 Change = Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]]
 """An object and its defaults to the object with or without them."""
 
-CONFIG_DEFAULTS: dict[str, Any] = {
-    "batch": 0,
-    "brick": "auto",
-    "device": "auto",
-    "dilation": 1,
-    "effort": 5,
-    "embedding_size": 0,
-    "engine": "auto",
-    "epochs": 0,
-    "features": ["all"],
-    "fold": 0,
-    "hidden_layers": 2,
-    "key_frames": "all",
-    "learning_rate": 0.01,
-    "max_error": None,
-    "max_error_rel": None,
-    "preset": "default",
-    "psnr": None,
-    "psnr_bulk": None,
-    "ratio": None,
-    "samples": "all",
-    "schedule": "cosine",
-    "seed": 0,
-    "tables": "auto",
-    "tile": "auto",
-    "timings": True,
-    "train_on_seconds": 3600,
-    "width": 0,
-    "without": [],
-}
-"""Values of the settings that a header leaves out."""
-BEFORE_PRESETS = ("profile", "access")
-"""Settings that stood in place of `preset`."""
 DEFAULTS: dict[str, Any] = {
     "features": ["all"],
     "dilation": 1,
     "coreset_fraction": 1.0,
     "coordinates": {},
-    "config": CONFIG_DEFAULTS,
     "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
     "history": {},
 }
@@ -679,22 +645,8 @@ def brief(header: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def complete(header: Mapping[str, Any]) -> dict[str, Any]:
-    """A header with all that was left out; what is there stays, of whatever form it is.
-
-    Settings of the profile and the access, which older encoders had, become the preset.
-    """
-    config = header.get("config")
-    if isinstance(config, dict) and not config.keys().isdisjoint(BEFORE_PRESETS):
-        header = {**header, "config": _with_preset(config)}
+    """A header with all that was left out; what is there stays, of whatever form it is."""
     return _changed(_with, header)
-
-
-def _with_preset(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of an older encoder with the preset that they amount to."""
-    profile, access = (config.get(key) for key in BEFORE_PRESETS)
-    wish = access if access in ("fast", "small") else "default"
-    kept = {key: value for key, value in config.items() if key not in BEFORE_PRESETS}
-    return kept | {"preset": "published" if profile == PAPER else wish}
 
 
 def _changed(change: Change, header: Mapping[str, Any]) -> dict[str, Any]:

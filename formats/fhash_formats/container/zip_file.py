@@ -328,7 +328,7 @@ class PreviewSource(Source):
         self._begin.close()
 
 
-FORMAT_VERSION = (2, 0)
+FORMAT_VERSION = (3, 0)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 COMMENT = re.compile(rb"fhash ([0-9]{1,4}) sha256=[0-9a-f]{64}\Z")
 """The comment at the end of a container: major version of the format, digest of the directory."""

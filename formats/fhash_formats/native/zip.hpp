@@ -51,7 +51,7 @@ struct Directory {
     const Member* find(const std::string& name) const;
 };
 
-constexpr int MAJOR = 2;  // version of the format that is read
+constexpr int MAJOR = 3;  // version of the format that is read
 // Fails for another one.
 bool refuse_version(int major, fhash_error& error);
 
