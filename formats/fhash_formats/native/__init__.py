@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 25
+ABI_VERSION = 26
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -57,6 +57,7 @@ _TILES: Prototypes = {
     "fhash_tile_decode": (*_STREAM, ctypes.c_int32, ARRAY, ARRAY, ARRAY),
     "fhash_tile_table": (*_STREAM, ctypes.c_int32, *(ARRAY,) * 4),
     "fhash_tile_uncorrected": (*_STREAM, *(ARRAY,) * 4),
+    "fhash_tile_region": (*_STREAM, *(ARRAY,) * 4),
     "fhash_tile_part": (*_TILE, *(ARRAY,) * 4),
     "fhash_tile_fill": (*_TILE, ARRAY, ARRAY, ctypes.c_int32, ARRAY, ARRAY),
     "fhash_tile_forward": (*_TILE, *(ARRAY,) * 3),

@@ -10,7 +10,7 @@
 
 // ABI number. Raise it whenever the signature or the meaning of an exported function changes;
 // native/__init__.py holds the same number and the table of prototypes.
-constexpr std::int64_t FHASH_ABI = 25;
+constexpr std::int64_t FHASH_ABI = 26;
 
 // FHASH_KERNEL before a function that fhash_function finds by its name; others do not see it.
 #define FHASH_KERNEL extern "C"

@@ -13,11 +13,11 @@
     FIND(free_f64) FIND(head_apply) FIND(mask_levels_f32) FIND(mask_levels_f64) FIND(plan) \
     FIND(quantise_f32) FIND(quantise_f64) FIND(reconstruct_f32) FIND(reconstruct_f64) \
     FIND(residual_f32_f32) FIND(residual_f32_f64) FIND(residual_f64_f32) FIND(residual_f64_f64) \
-    FIND(tile_fill) FIND(tile_foretold) FIND(tile_forward) FIND(tile_part) FIND(tile_table) \
-    FIND(tile_uncorrected) FIND(transform_forward_f32) FIND(transform_forward_f64) \
-    FIND(transform_inverse_f32) FIND(transform_inverse_f64) FIND(trellis_choose_f32) \
-    FIND(trellis_choose_f64) FIND(trellis_count) FIND(trellis_guess_f32) FIND(trellis_guess_f64) \
-    FIND(within_f32) FIND(within_f64)
+    FIND(tile_fill) FIND(tile_foretold) FIND(tile_forward) FIND(tile_part) FIND(tile_region) \
+    FIND(tile_table) FIND(tile_uncorrected) FIND(transform_forward_f32) \
+    FIND(transform_forward_f64) FIND(transform_inverse_f32) FIND(transform_inverse_f64) \
+    FIND(trellis_choose_f32) FIND(trellis_choose_f64) FIND(trellis_count) \
+    FIND(trellis_guess_f32) FIND(trellis_guess_f64) FIND(within_f32) FIND(within_f64)
 
 // Their types do not matter here.
 #define FHASH_DECLARE(NAME) void fhash_##NAME();

@@ -14,6 +14,7 @@ from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileEr
 from fhash_formats.transform.predict import encode_differences
 from fhash_formats.transform.tile import (
     corrected_region,
+    decode_region,
     decode_tile,
     decode_tile_mask,
     decode_tile_table,
@@ -22,7 +23,10 @@ from fhash_formats.transform.tile import (
     uncorrected,
 )
 from fhash_formats.transform.tile_format import (
+    BLOCKS,
     DIFFERENCES,
+    FLAGS,
+    KIND,
     Shape,
     TileSettings,
     parse_stream,
@@ -136,7 +140,9 @@ class TransformCoder:
     Attributes:
         settings: settings that all chunks share; None where each stream has its own.
         masked: whether the chunks say which of their values are occupied.
-        parted: whether a part of a chunk may be had sooner than all of it.
+        parted: whether a part of a chunk may be had sooner than all of it, without what a head
+            need not see.
+        boxed: whether a part of a chunk may be had from some of its blocks.
         axes: axis of the tile for each axis of a chunk; None for the last ones of t, z, y, x.
     """
 
@@ -178,7 +184,8 @@ class TransformCoder:
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
         has_head = self.settings is not None and self.settings.head is not None
-        self.parted = has_head and not self.masked and len(shape) == 4 and self.axes is None
+        self.boxed = not self.masked and len(shape) == 4 and self.axes is None
+        self.parted = has_head and self.boxed
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk, which keeps every bit where there are no settings."""
@@ -205,6 +212,15 @@ class TransformCoder:
         Raises DamagedFileError.
         """
         return self._decoded(decode_tile_table, data, lod)
+
+    def region(self, data: memoryview | bytes, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
+        """A part of the chunk, with the bits of `decode`, from the blocks that it needs.
+
+        None where there are no blocks, or the part needs many. Raises DamagedFileError.
+        """
+        if len(data) <= FLAGS or data[FLAGS] & KIND != BLOCKS:
+            return None
+        return decode_region(data, self._tile_shape, self._dtype, self.settings, part)
 
     def uncorrected(
         self, data: memoryview | bytes, part: tuple[slice, ...]

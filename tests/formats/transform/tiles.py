@@ -39,6 +39,17 @@ def same(values: Values, others: Values) -> bool:
     )
 
 
+WHOLE = (4, 12, 13, 14)
+"""Shape of a tile with a head."""
+
+
+def with_head(hidden: tuple[int, ...] = (12, 8)) -> TileSettings:
+    """Settings of tiles of the shape WHOLE, whose head has random weights."""
+    spec = spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), WHOLE)
+    head = random_head(hidden, spread=16.0)
+    return replace(SETTINGS, transform=spec, quantum=0.0, head=head, clip=True)
+
+
 def streams() -> dict[str, tuple[Values, bytes]]:
     """A tile and its stream, with own settings, for each combination of sections."""
     values = wave((1, 3, 4, 5))
