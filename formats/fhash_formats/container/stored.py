@@ -267,6 +267,10 @@ TABLE = ":table"
 UNCORRECTED = ":uncorrected"
 """Suffix of an array's name for its chunks of which only a part was corrected so far."""
 
+MOST_APART = 3
+"""Parts of a chunk that are decoded from some of its blocks, each at most half of the work, before
+all of it is decoded."""
+
 Part = tuple[slice, ...]
 
 
@@ -319,6 +323,7 @@ class StoredArray:
             None if sharding is None else ShardIndices(sharding, self.shape, chunks, source)
         )
         self._ahead = Ahead()
+        self._apart: dict[Index, int] = {}  # by chunk, how many parts of it were decoded
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
         """The values in `region`, in a new array.
@@ -531,10 +536,15 @@ class StoredArray:
         """A part of a chunk; of one that was not read before, where it can, without the rest."""
         tiles, places = self._tiles, ((self.name, index, 0), (self.name + UNCORRECTED, index, 0))
         known = any(self._cache.get(place) is not None for place in places)
-        if known or not keep or tiles is None or not tiles.parted:
+        if known or not keep or tiles is None or not tiles.boxed:
             return self._chunk(index, keep=keep)[part]
         with self._stored_chunk(index) as data:
-            table = tiles.uncorrected(data, part)
+            apart = self._apart.get(index, 0)
+            some = tiles.region(data, part) if apart < MOST_APART else None
+            if some is not None:
+                self._apart[index] = apart + 1
+                return some
+            table = tiles.uncorrected(data, part) if tiles.parted else None
             values = tiles.decode(data) if table is None else tiles.corrected(table, part)
         kept = values if table is None else table
         kept.flags.writeable = False

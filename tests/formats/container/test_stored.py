@@ -22,13 +22,19 @@ from fhash_formats.container import array as coding
 from fhash_formats.container.array import ABSENT, transform_codecs
 from fhash_formats.container.header import COUNTS, SPARSE_FEATURE
 from fhash_formats.container.remote import TAIL_BYTES
-from fhash_formats.container.stored import Ahead, ChunkCache, StoredArray, chunks_after
+from fhash_formats.container.stored import (
+    MOST_APART,
+    Ahead,
+    ChunkCache,
+    StoredArray,
+    chunks_after,
+)
 from fhash_formats.errors import DamagedFileError, InputError, RegionError
 from fhash_formats.native import crc32c
 from fhash_formats.support import threads as parallel
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform import tile as decoding
-from fhash_formats.transform.tile import decode_tile, encode_tile
+from fhash_formats.transform.tile import Coding, decode_tile, encode_tile
 
 
 def values_of(dtype, shape):
@@ -234,6 +240,34 @@ def test_a_small_part_of_a_tile_comes_without_the_rest_and_the_rest_later(
         parts = ["fhash_tile_uncorrected", "fhash_tile_part", "fhash_tile_part"]
         assert asked == parts
         assert array.decode_chunk((0, 0, 0, 0)).tobytes() == whole.tobytes()
+        assert array.read().tobytes() == whole.tobytes()
+
+
+def test_small_parts_of_a_tile_in_blocks_come_from_some_of_them_and_then_from_all(
+    tmp_path, samples, monkeypatch
+) -> None:
+    shape = (2, 16, 16, 32)
+    values = np.random.default_rng(1).normal(0.5, 0.8, shape).clip(-2, 3).astype("f4")
+    stream = encode_tile(values, PLAIN, Coding(cut=3 << 4 | 3 << 8 | 4 << 12)).data
+    whole = decode_tile(stream, shape, "f4", PLAIN)
+    path = write_sharded(
+        tmp_path / "a.fhz", samples, values, shape, shape, [stream], codecs=transform_codecs(PLAIN)
+    )
+    asked: list[str] = []
+    real = decoding._call
+
+    def call(name, *arguments):
+        asked.append(name)
+        return real(name, *arguments)
+
+    monkeypatch.setattr(decoding, "_call", call)
+    parts = [(slice(t, t + 1), slice(0, 2), slice(2, 4), slice(20, 22)) for t in (0, 1)]
+    with Container.open(path) as container:
+        array = container.arrays[NAME]
+        for _ in range(4):
+            for part in parts:
+                assert array.read(part).tobytes() == whole[part].tobytes()
+        assert asked == ["fhash_tile_region"] * MOST_APART + ["fhash_tile_decode"]
         assert array.read().tobytes() == whole.tobytes()
 
 
