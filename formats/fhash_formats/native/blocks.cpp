@@ -145,6 +145,25 @@ BlockPlaces::BlockPlaces(const AxisTransform* axes, const Shape& tile, const Box
     }
 }
 
+bool each_of(int threads, size_t count, fhash_error& error,
+             const std::function<bool(size_t, fhash_error&)>& work) {
+    const size_t workers = std::max<size_t>(1, std::min((size_t)std::max(threads, 1), count));
+    std::vector<fhash_error> errors(workers);
+    std::vector<uint8_t> good(workers, 1);
+    const auto run = [&](int worker) {
+        const size_t number = (size_t)worker;
+        for (size_t i = number; i < count && good[number]; i += workers)
+            good[number] = work(i, errors[number]);
+    };
+    together((int)workers, run);
+    for (size_t i = 0; i < workers; i++) {
+        if (good[i]) continue;
+        error = errors[i];
+        return false;
+    }
+    return true;
+}
+
 Table block_table(const AxisTransform* axes, const Shape& shape) {
     return axes ? band_table(axes, shape) : single_band(shape);
 }
@@ -169,15 +188,34 @@ bool split_blocks(Bytes all, size_t count, std::vector<Bytes>& blocks, fhash_err
     return true;
 }
 
-bool decode_blocks(const BlockCoding& coding, int threads, Bytes bytes, int32_t* out,
+int64_t bands_within(const Table& table, const Shape& corner) {
+    int64_t count = 0;
+    for (int64_t band = 0; band < (int64_t)table.size() / TABLE_COLUMNS; band++) {
+        bool within = true;
+        for (size_t a = 0; a < 4; a++)
+            within = within && table[(size_t)(band * TABLE_COLUMNS) + a] < corner[a];
+        if (within) count = band + 1;
+    }
+    return count;
+}
+
+bool decode_blocks(const BlockCoding& coding, int lod, int threads, Bytes bytes, int32_t* out,
                    fhash_error& error) {
     const std::vector<Box> blocks = blocks_of(coding.shape, coding.cut);
     std::vector<Bytes> sections;
     if (!split_blocks(bytes, blocks.size(), sections, error)) return false;
+    std::vector<size_t> counts(blocks.size(), SIZE_MAX);
+    for (size_t i = 0; lod && i < blocks.size(); i++) {
+        Shape corner = blocks[i].shape();
+        const Table table = block_table(coding.axes, corner);
+        for (size_t a = 1; a < 4; a++) {
+            const int depth = is_wavelet(coding.axes, a) ? coding.axes[a].depth : 0;
+            corner[a] = band_lengths(corner[a], std::min(lod, depth)).back();
+        }
+        counts[i] = (size_t)bands_within(table, corner);
+    }
     const Box all = {{}, coding.shape};
-    const BlockReader reader = {coding, all, out};
-    return reader.run(threads, blocks, sections, std::vector<size_t>(blocks.size(), SIZE_MAX),
-                      error);
+    return BlockReader{coding, all, out}.run(threads, blocks, sections, counts, error);
 }
 
 Need::Need(const AxisTransform* axes, const Shape& shape, const Cut& cut, const Box& part) {

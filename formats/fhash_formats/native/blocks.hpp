@@ -7,6 +7,7 @@
 #pragma once
 
 #include <algorithm>
+#include <functional>
 
 #include "plan.hpp"
 
@@ -92,24 +93,8 @@ Table block_table(const AxisTransform* axes, const Shape& shape);
 
 // Calls work(number, error) for each number from 0 to before `count`, in so many threads; false
 // where one of the calls is.
-template <class Work>
-bool each_of(int threads, size_t count, fhash_error& error, const Work& work) {
-    const size_t workers = std::max<size_t>(1, std::min((size_t)std::max(threads, 1), count));
-    std::vector<fhash_error> errors(workers);
-    std::vector<uint8_t> good(workers, 1);
-    const auto run = [&](int worker) {
-        const size_t number = (size_t)worker;
-        for (size_t i = number; i < count && good[number]; i += workers)
-            good[number] = work(i, errors[number]);
-    };
-    together((int)workers, run);
-    for (size_t i = 0; i < workers; i++) {
-        if (good[i]) continue;
-        error = errors[i];
-        return false;
-    }
-    return true;
-}
+bool each_of(int threads, size_t count, fhash_error& error,
+             const std::function<bool(size_t, fhash_error&)>& work);
 
 // What the integers of blocks share.
 struct BlockCoding {
@@ -122,8 +107,12 @@ struct BlockCoding {
 // The sections of blocks in the bytes of all: lengths of all but the last one, then the bytes.
 bool split_blocks(Bytes all, size_t count, std::vector<Bytes>& blocks, fhash_error& error);
 
-// The integers of a tile from its blocks, by so many threads; `out` need not be zeros.
-bool decode_blocks(const BlockCoding& coding, int threads, Bytes bytes, int32_t* out,
+// How many of the first bands of a table hold the coefficients of a corner of a shape.
+int64_t bands_within(const Table& table, const Shape& corner);
+
+// The integers of a tile from its blocks, by so many threads; of a level of detail at least those
+// that it needs. `out` need not be zeros.
+bool decode_blocks(const BlockCoding& coding, int lod, int threads, Bytes bytes, int32_t* out,
                    fhash_error& error);
 
 // The way from a part of the values of a tile back to what it depends on.

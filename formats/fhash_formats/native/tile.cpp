@@ -167,35 +167,27 @@ bool decode_foretold(const Job& job, void* values, uint8_t* occupied, fhash_erro
     return true;
 }
 
-// The first bands of a table, up to the last that the coefficients of a level of detail are of.
-Table bands_within(const Table& table, const Shape& corner) {
-    size_t count = 0;
-    for (size_t band = 0; band < table.size() / TABLE_COLUMNS; band++) {
-        bool within = true;
-        for (size_t a = 0; a < 4; a++)
-            within = within && table[band * TABLE_COLUMNS + a] < corner[a];
-        if (within) count = band + 1;
-    }
-    return Table(table.begin(), table.begin() + (std::ptrdiff_t)(count * TABLE_COLUMNS));
-}
-
 // The quantised coefficients of a transformed tile, of a level of detail at least those that it
 // needs.
 template <class T>
 bool read_coefficients(const Job& job, const Plan<T>& plan, int32_t* out, fhash_error& error) {
     const Stream& stream = job.stream;
     if (is_cut(stream.cut))
-        return decode_blocks(coding_of(job, false), job.context.threads, stream.body, out, error);
-    const Table& all = plan.table;
-    const Table some = job.lod ? bands_within(all, plan.bands) : Table();
-    return decode_integers(stream.body.at, stream.body.left(), job.shape, job.lod ? some : all,
-                           job.settings->trellis, stream.fast, out, error);
+        return decode_blocks(coding_of(job, false), job.lod, job.context.threads, stream.body, out,
+                             error);
+    Table some;
+    if (job.lod)
+        some.assign(plan.table.begin(),
+                    plan.table.begin() + TABLE_COLUMNS * bands_within(plan.table, plan.bands));
+    return decode_integers(stream.body.at, stream.body.left(), job.shape,
+                           job.lod ? some : plan.table, job.settings->trellis, stream.fast, out,
+                           error);
 }
 
 bool read_residual(const Job& job, int32_t* out, fhash_error& error) {
     const Stream& stream = job.stream;
     if (is_cut(stream.cut))
-        return decode_blocks(coding_of(job, true), job.context.threads, stream.residual, out,
+        return decode_blocks(coding_of(job, true), 0, job.context.threads, stream.residual, out,
                              error);
     return decode_integers(stream.residual.at, stream.residual.left(), job.shape,
                            single_band(job.shape), false, stream.fast, out, error);

@@ -63,6 +63,7 @@ def streams() -> dict[str, tuple[Values, bytes]]:
     return {
         "plain": (values, encode_tile(values, coarse, own).data),
         "residual": (values, encode_tile(values, fine, replace(own, error=0.001)).data),
+        "blocks": (values, encode_tile(values, fine, replace(own, error=0.001, cut=1 << 4)).data),
         "missing": (holes, encode_tile(holes, SETTINGS, replace(own, error=0.04)).data),
         "empty": (holes, encode_tile(holes, coarse, own, in_coreset=nothing).data),
         "exact": (holes, exact_tile(holes).data),
