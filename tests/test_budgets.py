@@ -17,7 +17,7 @@ SUFFIXES = {".py", ".cpp", ".hpp", ".cu", ".cuh", ".c", ".h"}
 ROOTS = ("formats", "fhash_codec", "cli", "benchmarks", "tests")
 SLACK = 1.02
 """Factor by which a number of the table may stand above the house."""
-MODULES = {"product": 201, "tests": 220}
+MODULES = {"product": 201, "tests": 221}
 """Most modules in all, of the three packages of the product and of their tests."""
 
 

@@ -18,9 +18,12 @@ from grouped import WRITERS
 import fhash_codec
 from fhash_codec import Dataset, EncodeConfig, encoding
 from fhash_codec.compact import encode as compact
+from fhash_codec.compact import tiles
 from fhash_codec.compact.encode import CodedTable
 from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
 from fhash_formats.transform.head import Layer, NeighbourHead
+from fhash_formats.transform.tile import CodedTile, Coding
+from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 HERE = Path(__file__).parent
@@ -69,6 +72,7 @@ GOLDENS = {
     "compact-fast-bound": EncodeConfig(
         max_error=1e-4, effort=3, timings=False, preset="fast", features=("interval:0.5:2",)
     ),
+    "compact-blocks": EncodeConfig(psnr=50.0, effort=1, timings=False),
     "compact-linear": EncodeConfig(max_error=8.0, effort=8, timings=False),
     "compact-signs": EncodeConfig(psnr=40.0, effort=2, timings=False),
     "paper-transform": EncodeConfig(
@@ -290,6 +294,12 @@ def slow() -> ArraySeries:
     )
 
 
+def grit() -> ArraySeries:
+    """Noise, of which no basis makes less."""
+    values = np.random.default_rng(0).normal(0, 1, (5, 6, 9, 14)).astype(np.float32)
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+
+
 def head() -> NeighbourHead:
     """A head of random weights that hardly changes a value, of one hidden layer."""
     chance = np.random.default_rng(3)
@@ -321,6 +331,19 @@ def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
         fhash_codec.encode(SERIES.get(name, series)(), path, config)
 
 
+def encode_in_blocks(name: str, path: Path, config: EncodeConfig) -> None:
+    """Encode `series` in blocks, into which no tile of so small a file is cut."""
+    code = tiles.encode_tile
+
+    def coded(values: Any, settings: TileSettings, coding: Coding, **options: Any) -> CodedTile:
+        logs = (0 if a.kind == "klt" else max(a.depth, 2) for a in settings.transform.axes)
+        cut = sum(log << 4 * axis for axis, log in enumerate(logs))
+        return code(values, settings, replace(coding, cut=cut), **options)
+
+    with mock.patch.object(tiles, "encode_tile", coded):
+        fhash_codec.encode(SERIES.get(name, series)(), path, config)
+
+
 SERIES = {
     "compact-predictor": fronts,
     "compact-classes": classes,
@@ -330,6 +353,7 @@ SERIES = {
     "compact-head": cells,
     "compact-linear": fronts,
     "compact-trellis": fronts,
+    "compact-blocks": grit,
     "compact-source": with_source,
     "compact-named": long_axis,
     "compact-origin": nanoseconds,
@@ -367,6 +391,8 @@ def make(name: str, path: Path) -> None:
         pack(path)
     elif name in PLAIN:
         fhash_codec.export_plain(HERE / f"{PLAIN[name]}.fhz", path)
+    elif name.endswith("-blocks"):
+        encode_in_blocks(name, path, GOLDENS[name])
     elif name.endswith("-head"):
         encode_with_head(name, path, GOLDENS[name])
     else:

@@ -15,6 +15,7 @@ import fhash_codec
 from fhash_codec.header import history_line
 from fhash_formats.container.reader import Container
 from fhash_formats.transform.tile_format import (
+    BLOCKS,
     DIFFERENCES,
     LABELS,
     PREDICTED,
@@ -24,6 +25,7 @@ from fhash_formats.transform.tile_format import (
 
 HERE = Path(__file__).parent
 COMPACT = [
+    "compact-blocks",
     "compact-bound",
     "compact-mask",
     "compact-predictor",
@@ -163,7 +165,7 @@ def test_goldens_have_tiles_of_every_coder() -> None:
                 if array.coding == "fhash.transform":
                     streams = (array.coded(index) for index in np.ndindex(*array.grid))
                     found |= {(s.kind, s.fast) for s in map(parse_stream, map(bytes, streams))}
-    plain = {(kind, False) for kind in (TRANSFORMED, PREDICTED, LABELS, DIFFERENCES)}
+    plain = {(kind, False) for kind in (TRANSFORMED, PREDICTED, LABELS, DIFFERENCES, BLOCKS)}
     assert found >= {*plain, (TRANSFORMED, True)}
 
 

@@ -197,6 +197,11 @@ def tiles(draw: Draw) -> tuple[Any, TileSettings, Coding, Any]:
         error=error,
         own_settings=draw(st.booleans()),
         fast=draw(st.booleans()),
+        cut=sum(
+            draw(st.sampled_from([0, max(axis.depth, 1)])) << 4 * a
+            for a, axis in enumerate(settings.transform.axes)
+            if axis.kind != "klt"
+        ),
     )
     return values, settings, coding, mask
 

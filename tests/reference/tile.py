@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numcodecs.zstd import decompress
 
-from reference.bands import bands_of, single_band
+from reference.bands import WAVELETS, Band, bands_of, lengths, single_band
 from reference.fast import decode_fast
 from reference.head import apply_head, unpack_head
 from reference.integers import decode_integers
 from reference.labels import LabelDecoder, number_in, unpack_labelled, unpack_planes
 from reference.masks import mask_levels, unpack_mask
 from reference.predictor import decode_predicted, passes_of
-from reference.transform import Axis, inverse, unpack_basis
+from reference.transform import Axis, inverse, is_coupled, unpack_basis
 
 Values = npt.NDArray[Any]
 Settings = dict[str, Any]
 
-TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES = range(6)
+TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES, BLOCKS = range(7)
 """Kinds of streams, the lower three bits of the flags."""
 OWN, MISSING, RESIDUAL, MASKED, FAST = 8, 16, 32, 64, 128
 """Other bits of the flags."""
@@ -157,7 +158,7 @@ def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
         values = cast(np.full(stream.shape, float(settings["center"])), dtype)
         mask = np.zeros(stream.shape, bool) if stream.masked else None
     else:
-        by_kind = {TRANSFORMED: transformed, PREDICTED: predicted}
+        by_kind = {TRANSFORMED: transformed, BLOCKS: transformed, PREDICTED: predicted}
         before, values = by_kind[stream.kind](stream)
         mask = None
         if stream.masked:
@@ -241,14 +242,8 @@ def predicted(stream: Stream) -> tuple[Values, Values]:
 
 def transformed(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by transform: before head and residual, and in their type."""
-    settings, shape, number = stream.settings, stream.shape, stream.working.type
-    bands = bands_of(settings["axes"], shape)
-    body = stream.sections["body"]
-    integers = (
-        decode_fast(body, shape, bands, settings["trellis"])
-        if stream.fast
-        else decode_integers(body, shape, bands, settings["trellis"])
-    )
+    settings, number = stream.settings, stream.working.type
+    integers = coded_integers(stream, "body")
     with np.errstate(all="ignore"):
         coefficients = dequantised(integers, settings, stream.working)
         values = inverse(coefficients, settings["axes"]) + number(settings["center"])
@@ -256,11 +251,73 @@ def transformed(stream: Stream) -> tuple[Values, Values]:
         if "head" in settings:
             after = apply_head(before, settings["head"])
         if "residual" in stream.sections:
-            coded = stream.sections["residual"]
-            decode = decode_fast if stream.fast else decode_integers
-            residual = decode(coded, shape, single_band(shape))
+            residual = coded_integers(stream, "residual")
             after = after.astype(np.float64) + residual * np.float64(settings["quantum"])
     return before, cast(after, stream.dtype)
+
+
+def coded_integers(stream: Stream, section: str) -> Values:
+    """The coefficients of a transformed tile, or its residual; in blocks or not."""
+    bytes_of, shape, is_body = stream.sections[section], stream.shape, section == "body"
+    axes = stream.settings["axes"] if is_body else [Axis("none")] * 4
+    trellis = is_body and stream.settings["trellis"]
+    decode = decode_fast if stream.fast else decode_integers
+    if stream.kind != BLOCKS:
+        bands = bands_of(axes, shape) if is_body else single_band(shape)
+        return decode(bytes_of, shape, bands, trellis)
+    logs = [byte >> shift & 15 for byte in stream.sections["body"][:2] for shift in (0, 4)]
+    boxes = list(product(*(blocks_along(n, log) for n, log in zip(shape, logs, strict=True))))
+    rest, sizes = bytes_of[2:] if is_body else bytes_of, []
+    for _ in boxes[1:]:
+        size, rest = number_in(rest)
+        sizes.append(size)
+    result = np.zeros(shape, np.int32)
+    for box, size in zip(boxes, [*sizes, len(rest) - sum(sizes)], strict=True):
+        own = tuple(last - first for first, last in box)
+        bands = bands_of(axes, own) if is_body else single_band(own)
+        integers = decode(rest[:size], own, bands, trellis)
+        first = [ends[0] for ends in box]
+        for band in bands:
+            there = places_of(band, axes, shape, own, first)
+            here = tuple(slice(a, b) for a, b in zip(band.low, band.high, strict=True))
+            result[there] = integers[here]
+        rest = rest[size:]
+    return result
+
+
+def blocks_along(n: int, log: int) -> list[tuple[int, int]]:
+    """The ends of each block of 2^log vertices along an axis; 0 for one block.
+
+    What is left is a block of its own if it is at least half as long.
+    """
+    length = 2**log if log else n
+    count = max(1, (n + length // 2) // length)
+    return [(i * length, n if i + 1 == count else (i + 1) * length) for i in range(count)]
+
+
+def places_of(
+    band: Band, axes: Sequence[Axis], shape: Sequence[int], own: Sequence[int], first: Sequence[int]
+) -> tuple[slice, ...]:
+    """The places that the coefficients of a band of a block have in the tile.
+
+    own: lengths of the block. first: its first vertices.
+    """
+    levels = [axis.depth if axis.kind in WAVELETS else 0 for axis in axes]
+    for a, (axis, n) in enumerate(zip(axes, own, strict=True)):
+        if band.low[a]:
+            ends = lengths(n, axis.depth)
+            levels[a] = next(
+                level
+                for level in range(1, axis.depth + 1)
+                if (ends[level], ends[level - 1]) == (band.low[a], band.high[a])
+            )
+    if is_coupled(axes[2], axes[3]) and bool(band.low[2]) != bool(band.low[3]):
+        levels[2] = levels[3] = levels[2 if band.low[2] else 3]
+    places = []
+    for a, level in enumerate(levels):
+        start = (first[a] >> level) + (lengths(shape[a], level)[level] if band.low[a] else 0)
+        places.append(slice(start, start + band.high[a] - band.low[a]))
+    return tuple(places)
 
 
 def dequantised(integers: Values, settings: Settings, working: np.dtype[Any]) -> Values:

@@ -81,43 +81,76 @@ template <class Run> bool aim_at(double wanted, double weight, double first, con
     return true;
 }
 
-// The integers of the cheapest path through the trellis, searched `passes` times.
-//
-// aim: null for the usual weight.
-template <class T>
-bool choose_levels(const Search<T>& search, const std::vector<T>& scaled, double weight, int passes,
-                   const Aim* aim, std::vector<int32_t>& levels, fhash_error& error) {
-    const Table& table = search.table();
-    const int64_t bands = (int64_t)table.size() / TABLE_COLUMNS;
-    int64_t coded = 0;
-    for (int64_t band = 0; band < bands; band++) {
-        int64_t product = 1;
-        const int32_t* const row = &table[(size_t)(band * TABLE_COLUMNS)];
-        for (int a = 0; a < 4; a++) product *= row[4 + a] - row[a];
-        coded += product;
-    }
-    std::vector<uint8_t> buckets((size_t)coded);
+// What is coded alone: a block of a tile, or all of it.
+template <class T> struct Piece {
+    Shape shape;
+    Table table;
+    std::vector<T> scaled;  // coefficients / step
+    std::vector<uint8_t> buckets;
     std::vector<int64_t> counts;
-    const auto choose = [&](double of) {
-        levels.assign(scaled.size(), 0);
-        return kernel_done(choose_path(scaled.data(), search.shape.data(), table.data(), bands,
-                                       buckets.data(), rates_of(counts, of).data(),
-                                       levels.data()),
-                           "the trellis", error);
-    };
-    for (int pass = 0; pass < std::max(passes, 1); pass++) {
+    std::vector<int32_t> levels;
+
+    int64_t bands() const { return (int64_t)table.size() / TABLE_COLUMNS; }
+    void make_buckets() {
+        int64_t coded = 0;
+        for (int64_t band = 0; band < bands(); band++) {
+            int64_t product = 1;
+            const int32_t* const row = &table[(size_t)(band * TABLE_COLUMNS)];
+            for (int a = 0; a < 4; a++) product *= row[4 + a] - row[a];
+            coded += product;
+        }
+        buckets.resize((size_t)coded);
+    }
+    // Counts indices: guessed ones, or those that were chosen.
+    bool count(bool guessed, fhash_error& error) {
         counts.assign(2 * BUCKETS * RATES, 0);
-        const int64_t* const shape = search.shape.data();
-        const int64_t code = pass == 0 ? guess_path(scaled.data(), shape, table.data(), bands,
-                                              buckets.data(), counts.data())
-                                 : fhash_trellis_count(levels.data(), shape, table.data(), bands,
-                                                       buckets.data(), counts.data());
-        if (!kernel_done(code, "the trellis", error)) return false;
+        const int64_t code =
+            guessed ? guess_path(scaled.data(), shape.data(), table.data(), bands(),
+                                 buckets.data(), counts.data())
+                    : fhash_trellis_count(levels.data(), shape.data(), table.data(), bands(),
+                                          buckets.data(), counts.data());
+        return kernel_done(code, "the trellis", error);
+    }
+    bool choose(const std::vector<int32_t>& rates, fhash_error& error) {
+        levels.assign(scaled.size(), 0);
+        return kernel_done(choose_path(scaled.data(), shape.data(), table.data(), bands(),
+                                       buckets.data(), rates.data(), levels.data()),
+                           "the trellis", error);
+    }
+};
+
+// The levels of each piece, those of the cheapest path through the trellis, searched `passes`
+// times.
+//
+// aim: null for the usual weight. measure: calls its function with the levels of all.
+template <class T>
+bool choose_levels(std::vector<Piece<T>>& pieces, int threads, double weight, int passes,
+                   const Aim* aim, const std::function<double()>& measure, fhash_error& error) {
+    std::vector<int64_t> counts;
+    const auto each = [&](const auto& work) {
+        return each_of(threads, pieces.size(), error,
+                       [&](size_t i, fhash_error& failed) { return work(pieces[i], failed); });
+    };
+    const auto choose = [&](double of) {
+        const std::vector<int32_t> rates = rates_of(counts, of);
+        return each([&](Piece<T>& piece, fhash_error& failed) {
+            return piece.choose(rates, failed);
+        });
+    };
+    for (Piece<T>& piece : pieces) piece.make_buckets();
+    for (int pass = 0; pass < std::max(passes, 1); pass++) {
+        if (!each([&](Piece<T>& piece, fhash_error& failed) {
+                return piece.count(pass == 0, failed);
+            }))
+            return false;
+        counts.assign(2 * BUCKETS * RATES, 0);
+        for (const Piece<T>& piece : pieces)
+            for (size_t i = 0; i < counts.size(); i++) counts[i] += piece.counts[i];
         if (!choose(weight)) return false;
     }
     if (!aim) return true;
-    return aim_at(aim->squares, weight, aim->measure(levels),
-                  [&](double of) { return choose(of) ? aim->measure(levels) : -1.0; });
+    return aim_at(aim->squares, weight, measure(),
+                  [&](double of) { return choose(of) ? measure() : -1.0; });
 }
 
 // Makes coefficients multiples of the step; false where one is too large for the trellis.
@@ -212,9 +245,18 @@ bool choose_integers(const Search<T>& search, std::vector<T>& coefficients,
                      const fhash_coding& coding, int passes, const Aim* aim,
                      std::vector<int32_t>& integers, fhash_error& error) {
     const double weight = coding.weight;
-    if (search.settings.trellis)
-        return scale_all(search, coefficients) &&
-               choose_levels(search, coefficients, weight, passes, aim, integers, error);
+    if (search.settings.trellis) {
+        if (!scale_all(search, coefficients)) return false;
+        std::vector<Piece<T>> whole(1);
+        whole[0].shape = search.shape;
+        whole[0].table = search.table();
+        whole[0].scaled.swap(coefficients);
+        const auto measure = [&] { return aim->measure(whole[0].levels); };
+        const bool done = choose_levels(whole, 1, weight, passes, aim, measure, error);
+        coefficients.swap(whole[0].scaled);
+        integers = std::move(whole[0].levels);
+        return done;
+    }
     std::vector<float> scaled;
     quantise_all(coefficients, search.settings.step, integers, scaled);
     if (weight <= 0) return true;
@@ -257,6 +299,85 @@ bool code_coefficients(const Search<T>& search, std::vector<T>& coefficients,
             integers[i] = (int32_t)std::nearbyint(coefficients[i] / (T)settings.step);
     if (!mended && !(coding.passes > 1 && chooses && !fast)) return true;
     return encode({false, fast, nullptr, 0});
+}
+
+namespace {
+
+// The bytes of blocks, after the lengths of all but the last one.
+void join_blocks(const std::vector<Buffer>& blocks, Buffer& data) {
+    for (size_t i = 0; i + 1 < blocks.size(); i++) put_leb(data, blocks[i].size());
+    for (const Buffer& block : blocks) data.insert(data.end(), block.begin(), block.end());
+}
+
+// A search on a block.
+template <class T> Search<T> search_on(const Search<T>& search, const Shape& shape) {
+    const auto plan = std::make_shared<Plan<T>>();
+    plan->table = block_table(search.settings.axes, shape);
+    return {search.context, search.settings, shape, nullptr, plan};
+}
+
+}  // namespace
+
+template <class T>
+bool code_blocks(const Search<T>& search, const Cut& cut, std::vector<T>& coefficients,
+                 const fhash_coding& coding, const Aim* aim, Buffer& data,
+                 std::vector<int32_t>& integers, fhash_error& error) {
+    const Settings& settings = search.settings;
+    const std::vector<Box> boxes = blocks_of(search.shape, cut);
+    const bool levels = settings.trellis && !coding.fast;
+    if (levels && !scale_all(search, coefficients)) return false;
+    std::vector<BlockPlaces> places;
+    std::vector<Piece<T>> pieces(boxes.size());
+    for (size_t i = 0; i < boxes.size(); i++) {
+        places.emplace_back(settings.axes, search.shape, boxes[i]);
+        pieces[i].shape = boxes[i].shape();
+        pieces[i].table = block_table(settings.axes, pieces[i].shape);
+        pieces[i].scaled.resize((size_t)vertices(pieces[i].shape));
+        places[i].gather(coefficients.data(), pieces[i].scaled.data());
+    }
+    integers.assign(coefficients.size(), 0);
+    const auto scatter = [&] {
+        for (size_t i = 0; i < boxes.size(); i++)
+            places[i].scatter(pieces[i].levels.data(), integers.data());
+    };
+    const auto measure = [&] {
+        scatter();
+        return aim->measure(integers);
+    };
+    const int threads = search.context.threads;
+    if (levels && !choose_levels(pieces, threads, coding.weight, coding.passes, aim, measure,
+                                 error))
+        return false;
+    std::vector<Buffer> coded(boxes.size());
+    const bool done = each_of(threads, boxes.size(), error, [&](size_t i, fhash_error& failed) {
+        Piece<T>& piece = pieces[i];
+        if (levels)
+            return encode_integers(piece.levels, piece.shape, piece.table,
+                                   {true, false, nullptr, 0}, coded[i], failed);
+        return code_coefficients(search_on(search, piece.shape), piece.scaled, coding, nullptr,
+                                 coded[i], piece.levels, failed);
+    });
+    if (!done) return false;
+    scatter();
+    data.assign({(uint8_t)(cut[0] | cut[1] << 4), (uint8_t)(cut[2] | cut[3] << 4)});
+    join_blocks(coded, data);
+    return true;
+}
+
+bool encode_in_blocks(const std::vector<int32_t>& integers, const Shape& shape, const Cut& cut,
+                      bool fast, int threads, Buffer& data, fhash_error& error) {
+    const std::vector<Box> boxes = blocks_of(shape, cut);
+    std::vector<Buffer> coded(boxes.size());
+    const bool done = each_of(threads, boxes.size(), error, [&](size_t i, fhash_error& failed) {
+        const Shape own = boxes[i].shape();
+        std::vector<int32_t> some((size_t)vertices(own));
+        BlockPlaces(nullptr, shape, boxes[i]).gather(integers.data(), some.data());
+        return encode_integers(some, own, single_band(own), {false, fast, nullptr, 0}, coded[i],
+                               failed);
+    });
+    data.clear();
+    if (done) join_blocks(coded, data);
+    return done;
 }
 
 namespace {
@@ -382,6 +503,8 @@ bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8
                                   const Aim*, std::vector<int32_t>&, fhash_error&); \
     template bool code_coefficients(const Search<T>&, std::vector<T>&, const fhash_coding&, \
                                     const Aim*, Buffer&, std::vector<int32_t>&, fhash_error&); \
+    template bool code_blocks(const Search<T>&, const Cut&, std::vector<T>&, const fhash_coding&, \
+                              const Aim*, Buffer&, std::vector<int32_t>&, fhash_error&); \
     template double predicted_error(const std::vector<T>&, double); \
     template bool fill_uncounted(const Search<T>&, const uint8_t*, const uint8_t*, int, \
                                  std::vector<T>&, fhash_error&);

@@ -362,6 +362,29 @@ template <class T> double squared_error(const Task& task, const T* decoded) {
     return sum;
 }
 
+// The cut that is asked for, or one that pays; none where it makes one block.
+template <class T>
+bool find_cut(const Task& task, const std::vector<T>& coefficients, Cut& cut, fhash_error& error) {
+    const Settings& settings = task.settings;
+    const int32_t given = task.coding.cut;
+    if (given) for (size_t a = 0; a < 4; a++) cut[a] = given >> 4 * a & 15;
+    else cut = choose_cut(settings, task.shape, task.coding.fast != 0, coefficients);
+    const size_t count = count_blocks(task.shape, cut);
+    if (count < 2) cut = {};
+    return (fits(cut, settings.axes) && count <= MAX_BLOCKS) ||
+           fail(error, FHASH_ERROR_ARGUMENT,
+                "blocks are cut where the transform is not, or are more than %zu", MAX_BLOCKS);
+}
+
+bool code_residual(const Task& task, const Cut& cut, std::vector<int32_t>& residual, Buffer& rest,
+                   fhash_error& error) {
+    const bool fast = task.coding.fast != 0;
+    if (is_cut(cut))
+        return encode_in_blocks(residual, task.shape, cut, fast, task.context.threads, rest, error);
+    return encode_integers(residual, task.shape, single_band(task.shape), {false, fast, nullptr, 0},
+                           rest, error);
+}
+
 // The stream of a transformed tile; false without an error where it has to be stored exactly.
 template <class T>
 bool transformed(const Task& task, Coded& coded, fhash_error& error) {
@@ -386,8 +409,13 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
                    ? squared_error(task, linear.data())
                    : -1;
     };
-    if (!code_coefficients(*search, coefficients, task.coding, aim.squares > 0 ? &aim : nullptr,
-                           body, integers, error))
+    Cut cut;
+    if (!find_cut(task, coefficients, cut, error)) return false;
+    const Aim* const aims = aim.squares > 0 ? &aim : nullptr;
+    if (!(is_cut(cut) ? code_blocks(*search, cut, coefficients, task.coding, aims, body, integers,
+                                    error)
+                      : code_coefficients(*search, coefficients, task.coding, aims, body, integers,
+                                          error)))
         return false;
     coded.nonzero = (int64_t)integers.size() - std::count(integers.begin(), integers.end(), 0);
     coefficients = {};
@@ -409,14 +437,12 @@ bool transformed(const Task& task, Coded& coded, fhash_error& error) {
     correct_within(settings, task.type, linear.data(), residual, task.size(),
                    coded.decoded.data());
     if (bound && !keeps_bound(task, coded)) return false;
-    Sections sections(TRANSFORMED, task.own(), settings.mask != nullptr);
+    Sections sections(is_cut(cut) ? BLOCKS : TRANSFORMED, task.own(), settings.mask != nullptr);
     if (task.coding.fast) sections.flags |= FAST;
     if (!task.missing.empty()) sections.add(MISSING, task.missing);
     sections.add(0, std::move(body));
     if (!residual.empty()) {
-        const IntegerCoding how = {false, task.coding.fast != 0, nullptr, 0};
-        if (!encode_integers(residual, task.shape, single_band(task.shape), how, rest, error))
-            return false;
+        if (!code_residual(task, cut, residual, rest, error)) return false;
         sections.add(RESIDUAL, std::move(rest));
     }
     if (settings.mask) sections.add(0, std::move(mask));

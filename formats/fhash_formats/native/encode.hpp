@@ -95,6 +95,19 @@ bool code_coefficients(const Search<T>& search, std::vector<T>& coefficients,
                        const fhash_coding& coding, const Aim* aim, Buffer& data,
                        std::vector<int32_t>& integers, fhash_error& error);
 
+// The same in blocks (blocks.hpp).
+template <class T>
+bool code_blocks(const Search<T>& search, const Cut& cut, std::vector<T>& coefficients,
+                 const fhash_coding& coding, const Aim* aim, Buffer& data,
+                 std::vector<int32_t>& integers, fhash_error& error);
+// Numbers of a tile that were not transformed, in blocks.
+bool encode_in_blocks(const std::vector<int32_t>& integers, const Shape& shape, const Cut& cut,
+                      bool fast, int threads, Buffer& data, fhash_error& error);
+// The blocks of a tile that is large enough for them (cut.cpp).
+template <class T>
+Cut choose_cut(const Settings& settings, const Shape& shape, bool fast,
+               const std::vector<T>& coefficients);
+
 // `target` with fill values where it is not counted (transform/tile.py, filled).
 template <class T>
 bool fill_uncounted(const Search<T>& search, const uint8_t* counted, const uint8_t* finite,

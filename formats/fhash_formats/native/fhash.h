@@ -139,6 +139,8 @@ typedef struct fhash_coding {
     int32_t keep_missing; /* 1: values that are not finite come back as they were */
     int32_t own_settings; /* 1: the stream holds the settings */
     int32_t fast;         /* 1: the fast coder, for more bytes */
+    int32_t cut;          /* logarithms of the lengths of blocks to the base 2, four bits each for t, z, y, x from the
+                           * lowest on; 0: as pays for small regions */
 } fhash_coding;
 
 /* Encode a tile with the settings of tile->settings: any transform, basis, head, predictor, mask or labels that they

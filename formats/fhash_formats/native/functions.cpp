@@ -17,10 +17,11 @@
     FIND(quantise_f32) FIND(quantise_f64) FIND(reconstruct_f32) FIND(reconstruct_f64) \
     FIND(residual_f32_f32) FIND(residual_f32_f64) FIND(residual_f64_f32) \
     FIND(residual_f64_f64) FIND(tile_fill) FIND(tile_foretold) FIND(tile_forward) \
-    FIND(tile_part) FIND(tile_table) FIND(tile_uncorrected) FIND(transform_forward_f32) \
-    FIND(transform_forward_f64) FIND(transform_inverse_f32) FIND(transform_inverse_f64) \
-    FIND(trellis_choose_f32) FIND(trellis_choose_f64) FIND(trellis_count) \
-    FIND(trellis_guess_f32) FIND(trellis_guess_f64) FIND(within_f32) FIND(within_f64)
+    FIND(tile_part) FIND(tile_region) FIND(tile_table) FIND(tile_uncorrected) \
+    FIND(transform_forward_f32) FIND(transform_forward_f64) FIND(transform_inverse_f32) \
+    FIND(transform_inverse_f64) FIND(trellis_choose_f32) FIND(trellis_choose_f64) \
+    FIND(trellis_count) FIND(trellis_guess_f32) FIND(trellis_guess_f64) FIND(within_f32) \
+    FIND(within_f64)
 
 // The address of a function; null for an unknown name.
 FHASH_EXPORT void* fhash_function(const char* name) {

@@ -203,6 +203,12 @@ int32_t fhash_tile_table(fhash_context* context, const fhash_tile* tile, const v
 int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile, const void* stream,
                                size_t size, const int64_t* part, float* values, int32_t* done,
                                fhash_error* error);
+/* region.cpp */
+int32_t fhash_tile_region(fhash_context* context, const fhash_tile* tile, const void* stream,
+                          size_t size, const int64_t* part, void* values, int32_t* done,
+                          fhash_error* error);
+
+/* part.cpp */
 int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile, const float* table,
                         const int64_t* part, void* values, fhash_error* error);
 int32_t fhash_tile_foretold(fhash_context* context, const fhash_tile* tile, const int32_t* integers,

@@ -6,54 +6,12 @@
 #include "functions.h"
 #include "encode.hpp"
 #include "priors.hpp"
+#include "region.hpp"
 
 namespace fhash {
 namespace {
 
 constexpr int64_t SHARE = 4;  // a part is corrected alone where its head sees a SHARE-th of frames
-constexpr int64_t REACH = 2;  // farthest vertex along an axis that the inputs of a head come from
-
-// A part: first vertices along t, z, y, x, and those after the last.
-struct Part {
-    int64_t first[4], last[4];
-
-    Shape shape() const {
-        return {last[0] - first[0], last[1] - first[1], last[2] - first[2], last[3] - first[3]};
-    }
-};
-
-// A part and what its head sees around it.
-Part widened(const Part& part, const Shape& shape) {
-    Part wide;
-    for (int a = 0; a < 4; a++) {
-        wide.first[a] = std::max<int64_t>(0, part.first[a] - REACH);
-        wide.last[a] = std::min(shape[(size_t)a], part.last[a] + REACH);
-    }
-    return wide;
-}
-
-// A part of an array as an array of its own.
-std::vector<float> copied(const float* in, const Shape& shape, const Part& part) {
-    std::vector<float> out;
-    out.reserve((size_t)vertices(part.shape()));
-    for (int64_t t = part.first[0]; t < part.last[0]; t++)
-        for (int64_t z = part.first[1]; z < part.last[1]; z++)
-            for (int64_t y = part.first[2]; y < part.last[2]; y++) {
-                const float* const row = in + ((t * shape[1] + z) * shape[2] + y) * shape[3];
-                out.insert(out.end(), row + part.first[3], row + part.last[3]);
-            }
-    return out;
-}
-
-bool is_part(const int64_t* numbers, const Shape& shape, Part& part) {
-    for (int a = 0; a < 4; a++) {
-        part.first[a] = numbers[2 * a];
-        part.last[a] = numbers[2 * a + 1];
-        if (part.first[a] < 0 || part.first[a] >= part.last[a] || part.last[a] > shape[(size_t)a])
-            return false;
-    }
-    return true;
-}
 
 // The values of a tile in float32 or float64: those before the head where it is transformed, else
 // the values, of which the centre stands for those that are not finite.
@@ -168,7 +126,7 @@ FHASH_KERNEL int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_
         Job job = {*context, {}, 0, 0, {}, nullptr};
         *done = 0;
         if (!make_job(job, tile, stream, size, failed)) return false;
-        Part some;
+        Box some;
         if (!is_part(part, job.shape, some))
             return fail(failed, FHASH_ERROR_ARGUMENT, "a part lies in its tile");
         if (!job.settings || !job.settings->head) return true;
@@ -192,23 +150,19 @@ FHASH_KERNEL int32_t fhash_tile_part(fhash_context* context, const fhash_tile* t
                                      fhash_error* error) {
     return reported(error, [&](fhash_error& failed) {
         return with_settings(context, tile, failed, [&](const auto& settings, const Shape& shape) {
-            Part some;
+            Box some;
             if (!is_part(part, shape, some) || !settings->head)
                 return fail(failed, FHASH_ERROR_ARGUMENT,
                             "a part lies in its tile, which has a head");
             // At the ends of the tile the head sees its edge either way; farther in, what it sees
             // instead of what was cut off is cut off again.
-            const Part wide = widened(some, shape);
+            const Box wide = widened(some, shape);
             const std::vector<float> base = copied(table, shape, wide);
             std::vector<float> head(base.size());
             if (!apply_head(*context, *settings->head, base.data(), wide.shape(), head.data(),
                             failed))
                 return false;
-            Part inner;
-            for (int a = 0; a < 4; a++) {
-                inner.first[a] = some.first[a] - wide.first[a];
-                inner.last[a] = some.last[a] - wide.first[a];
-            }
+            const Box inner = relative(some, wide);
             const std::vector<float> kept = copied(head.data(), wide.shape(), inner);
             const int64_t n = (int64_t)kept.size();
             const bool about = !settings->origin.zero();

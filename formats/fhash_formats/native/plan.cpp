@@ -22,13 +22,6 @@ struct Span {
 };
 using Spans = std::vector<Span>;
 
-// Lengths of the low band after 0 to `depth` levels.
-std::vector<int64_t> band_lengths(int64_t n, int depth) {
-    std::vector<int64_t> lengths = {n};
-    for (int i = 0; i < depth; i++) lengths.push_back((lengths.back() + 1) / 2);
-    return lengths;
-}
-
 Spans spans_of(const AxisTransform& axis, int64_t length) {
     Spans spans;
     const auto add = [&](int level, int64_t start, int64_t stop) {
@@ -151,10 +144,6 @@ struct Bands {
         rows[key] = (int)rows.size();
     }
 };
-
-bool is_coupled(const AxisTransform& y, const AxisTransform& x) {
-    return y.wavelet() && y.kind == x.kind && y.depth == x.depth;
-}
 
 // Norms of the columns, with sums from the first row on.
 std::vector<double> column_norms(const double* matrix, int64_t rows, int64_t columns) {
@@ -409,6 +398,16 @@ std::vector<int32_t> kept_corner(const int32_t* integers, const Shape& shape, co
 }
 
 }  // namespace
+
+bool is_coupled(const AxisTransform& y, const AxisTransform& x) {
+    return y.wavelet() && y.kind == x.kind && y.depth == x.depth;
+}
+
+std::vector<int64_t> band_lengths(int64_t n, int depth) {
+    std::vector<int64_t> lengths = {n};
+    for (int i = 0; i < depth; i++) lengths.push_back((lengths.back() + 1) / 2);
+    return lengths;
+}
 
 Table band_table(const AxisTransform* axes, const Shape& shape) {
     Spans spans[4];

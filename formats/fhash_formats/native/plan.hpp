@@ -7,6 +7,12 @@ namespace fhash {
 
 constexpr int MAX_LOD = 10, FORWARD = -1;
 
+// Lengths of the low band of an axis after 0 to `depth` levels.
+std::vector<int64_t> band_lengths(int64_t n, int depth);
+
+// Whether y and x are transformed together, each level the low half of both.
+bool is_coupled(const AxisTransform& y, const AxisTransform& x);
+
 // Norms along two axes together, as two factors: (t, z) and (y, x).
 struct Norms {
     std::vector<double> tz, yx;

@@ -167,35 +167,44 @@ bool decode_foretold(const Job& job, void* values, uint8_t* occupied, fhash_erro
     return true;
 }
 
+// The quantised coefficients of a transformed tile, of a level of detail at least those that it
+// needs.
+template <class T>
+bool read_coefficients(const Job& job, const Plan<T>& plan, int32_t* out, fhash_error& error) {
+    const Stream& stream = job.stream;
+    if (is_cut(stream.cut))
+        return decode_blocks(coding_of(job, false), job.lod, job.context.threads, stream.body, out,
+                             error);
+    Table some;
+    if (job.lod)
+        some.assign(plan.table.begin(),
+                    plan.table.begin() + TABLE_COLUMNS * bands_within(plan.table, plan.bands));
+    return decode_integers(stream.body.at, stream.body.left(), job.shape,
+                           job.lod ? some : plan.table, job.settings->trellis, stream.fast, out,
+                           error);
+}
+
+bool read_residual(const Job& job, int32_t* out, fhash_error& error) {
+    const Stream& stream = job.stream;
+    if (is_cut(stream.cut))
+        return decode_blocks(coding_of(job, true), 0, job.context.threads, stream.residual, out,
+                             error);
+    return decode_integers(stream.residual.at, stream.residual.left(), job.shape,
+                           single_band(job.shape), false, stream.fast, out, error);
+}
+
 // The quantised coefficients and the residual of a transformed tile, the two at once where there
 // are threads. residual: of the size of the tile, or empty.
-bool read_integers(const Job& job, const Table& table, int32_t* coefficients,
+template <class T>
+bool read_integers(const Job& job, const Plan<T>& plan, int32_t* coefficients,
                    std::vector<int32_t>& residual, fhash_error& error) {
-    const Stream& stream = job.stream;
-    const bool trellis = job.settings->trellis;
-    fhash_error errors[2] = {};
-    bool done[2] = {true, true};
-    const auto decode = [&](int number) {
-        if (number == 0) {
-            done[0] = decode_integers(stream.body.at, stream.body.left(), job.shape, table, trellis,
-                                      stream.fast, coefficients, errors[0]);
-        } else {
-            done[1] = decode_integers(stream.residual.at, stream.residual.left(), job.shape,
-                                      single_band(job.shape), false, stream.fast, residual.data(),
-                                      errors[1]);
-        }
-    };
-    if (residual.empty()) {
-        decode(0);
-    } else if (job.context.threads > 1) {
-        together(2, decode);
-    } else {
-        decode(0);
-        decode(1);
-    }
-    for (int i = 0; i < 2; i++)
-        if (!done[i]) error = errors[i];
-    return done[0] && done[1];
+    const size_t count = residual.empty() ? 1 : 2;
+    // Blocks have threads of their own.
+    const int threads = is_cut(job.stream.cut) ? 1 : job.context.threads;
+    return each_of(threads, count, error, [&](size_t number, fhash_error& failed) {
+        return number == 0 ? read_coefficients(job, plan, coefficients, failed)
+                           : read_residual(job, residual.data(), failed);
+    });
 }
 
 // Values with their head, from those before; in other room than `base` where there are threads.
@@ -237,7 +246,7 @@ bool decode_transformed(const Job& job, void* values, uint8_t* occupied, double 
     std::vector<int32_t> integers;
     make_room(integers, (size_t)(direct ? 0 : n));
     int32_t* const coefficients = direct ? (int32_t*)values : integers.data();
-    if (!read_integers(job, plan->table, coefficients, residual, error)) return false;
+    if (!read_integers(job, *plan, coefficients, residual, error)) return false;
     const bool over = narrow && !job.lod;
     std::vector<T> room, corrected;
     make_room(room, (size_t)(over ? 0 : count));
@@ -249,13 +258,7 @@ bool decode_transformed(const Job& job, void* values, uint8_t* occupied, double 
     }
     if (job.stream.mask.at && !read_mask_by<T>(job, linear, occupied, error)) return false;
     if (!correct_by_head(job, linear, corrected, error)) return false;
-    correct_within(settings, type, linear, residual, n, values);
-    // Without a residual the values are within the range, and finite; clipped ones are in the end.
-    const bool may_exceed = !settings.clip && settings.quantum * 0x1p31 > largest / 2;
-    if (!residual.empty() && may_exceed && any_infinite(values, type, n))
-        return fail(error, FHASH_ERROR_DAMAGED, "a residual of a coded tile is beyond %.6g",
-                    largest);
-    return true;
+    return finish_within(settings, type, linear, residual, n, largest, values, error);
 }
 
 // The values of a tile with settings, but for labels.
@@ -397,6 +400,21 @@ template void correct_within(const Settings&, int32_t, const float*, const std::
 template void correct_within(const Settings&, int32_t, const double*, const std::vector<int32_t>&,
                              int64_t, void*);
 
+template <class T>
+bool finish_within(const Settings& settings, int32_t type, const T* base,
+                   const std::vector<int32_t>& residual, int64_t n, double largest, void* out,
+                   fhash_error& error) {
+    correct_within(settings, type, base, residual, n, out);
+    // Without a residual the values are within the range, and finite; clipped ones are in the end.
+    const bool may_exceed = !settings.clip && settings.quantum * 0x1p31 > largest / 2;
+    if (residual.empty() || !may_exceed || !any_infinite(out, type, n)) return true;
+    return fail(error, FHASH_ERROR_DAMAGED, "a residual of a coded tile is beyond %.6g", largest);
+}
+template bool finish_within(const Settings&, int32_t, const float*, const std::vector<int32_t>&,
+                            int64_t, double, void*, fhash_error&);
+template bool finish_within(const Settings&, int32_t, const double*, const std::vector<int32_t>&,
+                            int64_t, double, void*, fhash_error&);
+
 bool apply_head(const fhash_context& context, const Head& head, const float* in, const Shape& shape,
                 float* out, fhash_error& error) {
     const int64_t rows = shape[1] * shape[2];
@@ -417,14 +435,29 @@ bool apply_head(const fhash_context& context, const Head& head, const float* in,
     return true;
 }
 
+namespace {
+
+// The cut at the start of the body of a tile in blocks.
+bool take_cut(Stream& stream, fhash_error& error) {
+    const uint8_t* logs;
+    if (!stream.body.take(CUT_BYTES, logs)) return cut_short(error);
+    for (size_t a = 0; a < 4; a++) stream.cut[a] = logs[a / 2] >> 4 * (a % 2) & 15;
+    stream.kind = TRANSFORMED;
+    return is_cut(stream.cut) ||
+           fail(error, FHASH_ERROR_DAMAGED, "a coded tile has blocks that are not cut");
+}
+
+}  // namespace
+
 bool parse_stream(const uint8_t* data, size_t size, Stream& stream, fhash_error& error) {
     constexpr size_t CHECKSUM = 4;
-    constexpr int ALLOWED[6] = {OWN | MISSING | RESIDUAL | MASKED | FAST,
+    constexpr int ALLOWED[7] = {OWN | MISSING | RESIDUAL | MASKED | FAST,
                                 OWN | MISSING | MASKED,
                                 OWN | MASKED,
                                 OWN | MASKED,
                                 OWN | MISSING | MASKED,
-                                0};
+                                0,
+                                OWN | MISSING | RESIDUAL | MASKED | FAST};
     if (size <= CHECKSUM)
         return fail(error, FHASH_ERROR_DAMAGED, "a coded tile has %zu bytes, which are too few",
                     size);
@@ -435,7 +468,7 @@ bool parse_stream(const uint8_t* data, size_t size, Stream& stream, fhash_error&
     const int flags = data[CHECKSUM];
     stream = {};
     stream.kind = flags & 7;
-    if (stream.kind > DIFFERENCES || flags & ~7 & ~ALLOWED[stream.kind])
+    if (stream.kind > BLOCKS || flags & ~7 & ~ALLOWED[stream.kind])
         return fail(error, FHASH_ERROR_DAMAGED,
                     "a coded tile has the flags 0x%02x, which no encoder writes", flags);
     stream.masked = flags & MASKED;
@@ -463,7 +496,7 @@ bool parse_stream(const uint8_t* data, size_t size, Stream& stream, fhash_error&
         if (!rest.take(length, start)) return cut_short(error);
         each.section = {start, start + length};
     }
-    return true;
+    return stream.kind != BLOCKS || take_cut(stream, error);
 }
 
 bool make_job(Job& job, const fhash_tile* tile, const void* stream, size_t size,
@@ -490,6 +523,12 @@ bool make_job(Job& job, const fhash_tile* tile, const void* stream, size_t size,
                         origin.negative ? "-" : "",
                         (unsigned long long)(origin.negative ? 0 - origin.bits : origin.bits));
     }
+    const Cut& cut = job.stream.cut;
+    if (job.settings &&
+        (!fits(cut, job.settings->axes) || count_blocks(job.shape, cut) > MAX_BLOCKS))
+        return fail(error, FHASH_ERROR_DAMAGED,
+                    "a coded tile has blocks that its transform has not, or more than %zu",
+                    MAX_BLOCKS);
     return true;
 }
 
@@ -518,7 +557,7 @@ template <class T> bool decode_linear(const Job& job, T* values, fhash_error& er
     const auto plan = plan_for<T>(job.context, *job.settings, job.shape, job.lod, error);
     if (!plan) return false;
     std::vector<int32_t> integers((size_t)job.size()), nothing;
-    return read_integers(job, plan->table, integers.data(), nothing, error) &&
+    return read_integers(job, *plan, integers.data(), nothing, error) &&
            linear_values(*job.settings, *plan, integers.data(), values, error);
 }
 template bool decode_linear(const Job&, float*, fhash_error&);

@@ -1,17 +1,19 @@
 // Decoding of a tile (FORMAT.md, Streams and Decoding).
 #pragma once
 
-#include "plan.hpp"
+#include "blocks.hpp"
 
 namespace fhash {
 
-enum Kind { TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES };
+enum Kind { TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES, BLOCKS };
 constexpr int OWN = 8, MISSING = 16, RESIDUAL = 32, MASKED = 64, FAST = 128;
 
-// The flags and sections of a stream; a section that is not there has no start.
+// The flags and sections of a stream; a section that is not there has no start. Of BLOCKS the kind
+// is TRANSFORMED, and the body begins behind the cut.
 struct Stream {
     int kind;
     bool masked, fast;
+    Cut cut;
     Bytes settings, missing, body, residual, mask;
 };
 bool parse_stream(const uint8_t* data, size_t size, Stream& stream, fhash_error& error);
@@ -61,6 +63,20 @@ bool levels_of_mask(const MaskScores& mask, const Shape& shape, const L* linear,
 
 // Values of predicted integers, within the range.
 std::vector<double> foretold_values(const Settings& settings, const std::vector<int32_t>& integers);
+
+// How the coefficients of a job are coded, or its residual.
+inline BlockCoding coding_of(const Job& job, bool residual) {
+    const Settings& settings = *job.settings;
+    return {residual ? nullptr : settings.axes, job.shape, job.stream.cut,
+            !residual && settings.trellis, job.stream.fast};
+}
+
+// Corrected values of a tile or a part of it as `correct_within` makes them; false with an error
+// where a residual makes an infinite one. largest: of `check_numbers`.
+template <class T>
+bool finish_within(const Settings& settings, int32_t type, const T* base,
+                   const std::vector<int32_t>& residual, int64_t n, double largest, void* out,
+                   fhash_error& error);
 
 // Values with their residual in a type, within the range of the settings. residual: empty for none.
 // out: room for them; may be `base`.

@@ -13,13 +13,11 @@ import numpy.typing as npt
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.transform.predict import encode_differences
 from fhash_formats.transform.tile import (
-    corrected_region,
     decode_tile,
     decode_tile_mask,
     decode_tile_table,
     encode_tile,
     exact_tile,
-    uncorrected,
 )
 from fhash_formats.transform.tile_format import (
     DIFFERENCES,
@@ -136,7 +134,6 @@ class TransformCoder:
     Attributes:
         settings: settings that all chunks share; None where each stream has its own.
         masked: whether the chunks say which of their values are occupied.
-        parted: whether a part of a chunk may be had sooner than all of it.
         axes: axis of the tile for each axis of a chunk; None for the last ones of t, z, y, x.
     """
 
@@ -177,8 +174,6 @@ class TransformCoder:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
-        has_head = self.settings is not None and self.settings.head is not None
-        self.parted = has_head and not self.masked and len(shape) == 4 and self.axes is None
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk, which keeps every bit where there are no settings."""
@@ -205,21 +200,6 @@ class TransformCoder:
         Raises DamagedFileError.
         """
         return self._decoded(decode_tile_table, data, lod)
-
-    def uncorrected(
-        self, data: memoryview | bytes, part: tuple[slice, ...]
-    ) -> npt.NDArray[Any] | None:
-        """The chunk as `corrected` takes it; None where all of it is as well decoded.
-
-        Raises DamagedFileError.
-        """
-        assert self.settings is not None, "the coder is parted"
-        return uncorrected(data, self._tile_shape, self._dtype, self.settings, part)
-
-    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """A part of the chunk, with the bits of `decode`. table: what `uncorrected` gave."""
-        assert self.settings is not None
-        return corrected_region(table, part, self._dtype, self.settings)
 
     def decode_masked(
         self, data: memoryview | bytes

@@ -129,6 +129,8 @@ class Coding:
         keep_missing: whether values that are not finite come back as they were.
         own_settings: whether the stream holds the settings.
         fast: whether coefficients and residual are coded by the fast coder, for more bytes.
+        cut: logarithms of the lengths of blocks to the base 2, four bits each for t, z, y, x from
+            the lowest on; 0 for those that pay where small regions are read (native/cut.cpp).
     """
 
     weight: float = 0.0
@@ -142,6 +144,7 @@ class Coding:
     keep_missing: bool = True
     own_settings: bool = False
     fast: bool = False
+    cut: int = 0
 
 
 _DEFAULT_CODING = Coding()
@@ -400,6 +403,28 @@ def uncorrected(
     tile = _tile(shape, np.dtype(dtype), settings)
     call("fhash_tile_uncorrected", tile, *_stream(data), *results)
     return table if done[0] else None
+
+
+def decode_region(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None,
+    part: tuple[slice, ...],
+) -> Values | None:
+    """A part of the values of a tile, as `decode_tile` gives them, from the blocks that it needs.
+
+    None where the tile has no blocks, or so many are needed that it is as well decoded whole.
+
+    part: slices (t, z, y, x) with explicit ends.
+
+    Raises DamagedFileError for bytes that no encoder writes.
+    """
+    values = np.empty([along.stop - along.start for along in part], dtype)
+    done = ffi.new("int32_t *")
+    tile = _tile(shape, values.dtype, settings)
+    call("fhash_tile_region", tile, *_stream(data), _part(part), pointer(values), done)
+    return values if done[0] else None
 
 
 def corrected_region(

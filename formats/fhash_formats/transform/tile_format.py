@@ -349,8 +349,8 @@ def _check_finite(name: str, value: Any) -> None:
 Shape = tuple[int, int, int, int]
 """Lengths of a tile along (t, z, y, x)."""
 
-TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES = range(6)
-"""Kinds of streams."""
+TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES, BLOCKS = range(7)
+"""Kinds of streams; BLOCKS are transformed as well."""
 KIND = 7
 """Bits of the flags that hold the kind."""
 OWN = 8
@@ -371,10 +371,13 @@ _ALLOWED = {
     EXACT: OWN | MASKED,
     EMPTY: OWN | MISSING | MASKED,
     DIFFERENCES: 0,
+    BLOCKS: OWN | MISSING | RESIDUAL | MASKED | FAST,
 }
 """Flags that a stream of each kind may have."""
 _CHECKSUM = 4
 """Bytes of the checksum."""
+FLAGS = _CHECKSUM
+"""Place of the flags in a stream."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -382,7 +385,7 @@ class TileStream:
     """The sections of a stream. A section is None where the flags say that there is none.
 
     Attributes:
-        kind: TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY or DIFFERENCES.
+        kind: TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES or BLOCKS.
         masked: whether the stream says which values are occupied.
         fast: whether coefficients and residual are those of the fast coder.
         settings: the tile's own settings.

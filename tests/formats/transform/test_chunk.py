@@ -670,7 +670,6 @@ def test_a_chunk_is_coded_along_the_axes_that_are_named(settings: TileSettings |
     configuration = {**({} if settings is None else named(settings)), "axes": list(AXES)}
     given = TransformCoder([{"configuration": configuration}], FLOAT, values.shape)
     coded = encode_tile(wave(), SETTINGS, Coding(own_settings=settings is None))
-    assert not given.parted
     assert same(given.decode(coded.data), coded.decoded.transpose(order))
     if settings is not None:
         assert given.encode(values) == coded.data

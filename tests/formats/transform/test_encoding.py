@@ -17,12 +17,13 @@ from tiles import (
     SETTINGS,
     SHAPE,
     SPEC,
+    WHOLE,
     damaged_copies,
-    random_head,
     resealed,
     same,
     streams,
     wave,
+    with_head,
 )
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
@@ -385,19 +386,12 @@ def test_a_basis_longer_than_the_tile_is_damage_before_anything_is_decoded(axis:
         band_table(settings.transform, SHAPE)
 
 
-WHOLE = (4, 12, 13, 14)
 PARTS = {
     "corner": ((0, 1), (0, 2), (0, 3), (0, 1)),
     "far corner": ((3, 4), (10, 12), (11, 13), (13, 14)),
     "inside": ((1, 3), (4, 6), (5, 7), (6, 7)),
     "edge": ((0, 4), (0, 1), (6, 7), (11, 14)),
 }
-
-
-def with_head(hidden: tuple[int, ...] = (12, 8)) -> TileSettings:
-    spec = spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), WHOLE)
-    head = random_head(hidden, spread=16.0)
-    return replace(SETTINGS, transform=spec, quantum=0.0, head=head, clip=True)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64", "int16"])

@@ -39,6 +39,17 @@ def same(values: Values, others: Values) -> bool:
     )
 
 
+WHOLE = (4, 12, 13, 14)
+"""Shape of a tile with a head."""
+
+
+def with_head(hidden: tuple[int, ...] = (12, 8)) -> TileSettings:
+    """Settings of tiles of the shape WHOLE, whose head has random weights."""
+    spec = spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), WHOLE)
+    head = random_head(hidden, spread=16.0)
+    return replace(SETTINGS, transform=spec, quantum=0.0, head=head, clip=True)
+
+
 def streams() -> dict[str, tuple[Values, bytes]]:
     """A tile and its stream, with own settings, for each combination of sections."""
     values = wave((1, 3, 4, 5))
@@ -52,6 +63,7 @@ def streams() -> dict[str, tuple[Values, bytes]]:
     return {
         "plain": (values, encode_tile(values, coarse, own).data),
         "residual": (values, encode_tile(values, fine, replace(own, error=0.001)).data),
+        "blocks": (values, encode_tile(values, fine, replace(own, error=0.001, cut=1 << 4)).data),
         "missing": (holes, encode_tile(holes, SETTINGS, replace(own, error=0.04)).data),
         "empty": (holes, encode_tile(holes, coarse, own, in_coreset=nothing).data),
         "exact": (holes, exact_tile(holes).data),

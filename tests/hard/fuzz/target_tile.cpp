@@ -67,6 +67,8 @@ void decode_part(Reader& in, const fhash_tile& tile, const Bytes& stream) {
     is_told(fhash_tile_uncorrected(context(), &tile, stream.data(), stream.size(), part,
                                    table.data(), &done, nullptr));
     Bytes values(n * fhash_type_size(tile.type));
+    is_told(fhash_tile_region(context(), &tile, stream.data(), stream.size(), part, values.data(),
+                              &done, nullptr));
     is_told(fhash_tile_part(context(), &tile, table.data(), part, values.data(), nullptr));
 }
 
@@ -143,6 +145,7 @@ void code(Reader& in, const fhash_tile& tile) {
     for (std::int32_t* each : {&coding.filled, &coding.keep_missing,
                                &coding.own_settings, &coding.fast})
         *each = in.byte() & 1;
+    coding.cut = in.byte() & 1 ? in.byte() | in.byte() << 8 : 0;
     coding.passes = 1 + in.byte() % 2;
     coding.density = in.byte() % 3;
     Bytes counted = repeated<std::uint8_t>(in, n);

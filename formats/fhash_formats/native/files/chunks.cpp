@@ -4,18 +4,8 @@
 #include <cstring>
 
 #include "core.hpp"
+#include "functions.h"
 #include "inflate.hpp"
-
-FHASH_KERNEL std::int64_t fhash_crc32c(const void* in, std::int64_t n, std::int64_t crc,
-                                       std::int64_t plain);
-
-// Of part.cpp: a tile before its head, and a part of it with its head.
-FHASH_KERNEL int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile,
-                                            const void* stream, size_t size, const int64_t* part,
-                                            float* values, int32_t* done, fhash_error* error);
-FHASH_KERNEL int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile,
-                                     const float* table, const int64_t* part, void* values,
-                                     fhash_error* error);
 
 namespace fhash {
 
@@ -30,6 +20,9 @@ constexpr uint64_t SMALL_INDEX = 16 << 10; // bytes up to which all of an index 
 constexpr uint64_t SHARE = 4;              // as is one of which that share is needed
 constexpr uint64_t INDEX = 1000;           // in the place of a level of detail, in the cache
 constexpr uint64_t UNCORRECTED = 1001;     // likewise: tiles before their head
+constexpr uint64_t APART = 1002;           // likewise: how many parts of a tile were decoded
+constexpr int64_t MOST_APART = 3;          // then all of it is decoded
+constexpr int FLAGS = 4, KIND = 7, BLOCKS = 6;  // of a stream: place and bits of the kind
 
 // An inner chunk that is to be read.
 struct Wanted {
@@ -109,10 +102,13 @@ bool is_parted(const Array& array) {
     return headed && !array.masked() && array.usual && array.axes == 4;
 }
 
-// A part of a tile, first and last positions along t, z, y, x, out of the tile before its head.
-bool correct_part(fhash_context& context, const Array& array, const Chunk& table,
-                  const int64_t part[8], Chunk& chunk, fhash_error& error) {
-    const fhash_tile tile = tile_of(array);
+// Whether a part of a tile may be had from some of its blocks.
+bool is_boxed(const Array& array) {
+    return array.tiles && !array.masked() && array.usual && array.axes == 4;
+}
+
+// Makes room for a part of a tile, first and last positions along t, z, y, x.
+void make_part(const Array& array, const int64_t part[8], Chunk& chunk) {
     size_t count = 1;
     for (size_t a = 0; a < 4; a++) {
         chunk.first[a] = part[2 * a];
@@ -120,6 +116,13 @@ bool correct_part(fhash_context& context, const Array& array, const Chunk& table
         count *= size_t(chunk.shape[a]);
     }
     chunk.values.resize(count * fhash_type_size(array.type));
+}
+
+// A part of a tile out of the tile before its head.
+bool correct_part(fhash_context& context, const Array& array, const Chunk& table,
+                  const int64_t part[8], Chunk& chunk, fhash_error& error) {
+    const fhash_tile tile = tile_of(array);
+    make_part(array, part, chunk);
     return fhash_tile_part(&context, &tile, reinterpret_cast<const float*>(table.values.data()),
                            part, chunk.values.data(), &error) == FHASH_OK;
 }
@@ -319,9 +322,10 @@ struct Indices {
     }
 };
 
-// A chunk for the caller, and the tile before its head where that is to be kept instead of it.
+// A chunk for the caller, and what is kept instead of it where it is a part: the tile before its
+// head, or a mark of how many parts were decoded.
 struct Decoded {
-    std::shared_ptr<Chunk> chunk, table;
+    std::shared_ptr<Chunk> chunk, table, mark;
 };
 
 // Bytes that are read at once: of some inner chunks, one after the other.
@@ -341,17 +345,44 @@ struct Reading {
     const Manner& manner;
     const Visit& visit;
 
+    // The part of a tile that the region asks for.
+    void find_part(const Wanted& wanted, int64_t part[8]) const {
+        for (size_t a = 0; a < 4; a++) {
+            const int64_t start = wanted.place[a] * array.inner[a];
+            part[2 * a] = std::max(region.first[a] - start, int64_t(0));
+            part[2 * a + 1] = std::min(region.last[a] - start, array.inner[a]);
+        }
+    }
+
+    // That part from the blocks that it needs; without `mark` there is no such thing, or so many
+    // parts were decoded already that all of the tile is worth its time.
+    bool decode_region(const Wanted& wanted, const uint8_t* data, size_t size, Decoded& decoded,
+                       fhash_error& error) {
+        const ChunkPointer before = file.cache.get({array.number, wanted.number, APART});
+        const int64_t parts = before ? before->shape[0] : 0;
+        if (parts == MOST_APART || size <= FLAGS || (data[FLAGS] & KIND) != BLOCKS) return true;
+        const fhash_tile tile = tile_of(array);
+        int64_t part[8];
+        find_part(wanted, part);
+        int32_t apart = 0;
+        make_part(array, part, *decoded.chunk);
+        if (fhash_tile_region(file.context, &tile, data, size, part, decoded.chunk->values.data(),
+                              &apart, &error) != FHASH_OK)
+            return false;
+        if (apart) {
+            decoded.mark = std::make_shared<Chunk>();
+            decoded.mark->shape[0] = parts + 1;
+        } else decoded.chunk = std::make_shared<Chunk>();
+        return true;
+    }
+
     // A tile before its head, and the part of it that the region asks for; `done` says whether
     // there is such a thing.
     bool decode_part(const Wanted& wanted, const uint8_t* data, size_t size, Chunk& table,
                      Chunk& chunk, bool& done, fhash_error& error) {
         const fhash_tile tile = tile_of(array);
         int64_t part[8];
-        for (size_t a = 0; a < 4; a++) {
-            const int64_t start = wanted.place[a] * array.inner[a];
-            part[2 * a] = std::max(region.first[a] - start, int64_t(0));
-            part[2 * a + 1] = std::min(region.last[a] - start, array.inner[a]);
-        }
+        find_part(wanted, part);
         int32_t apart = 0;
         table.shape = array.inner;
         if (!may_use(*file.context, 8 * array.inner_values(), error)) return false;
@@ -371,7 +402,11 @@ struct Reading {
         const size_t size = size_t(wanted.stored.length - wanted.stored.skip);
         bool done = false, good = true;
         decoded.chunk = std::make_shared<Chunk>();
-        if (!manner.lod && manner.keep && is_parted(array)) {
+        if (!manner.lod && manner.keep && is_boxed(array)) {
+            good = decode_region(wanted, stream, size, decoded, error);
+            done = decoded.mark != nullptr;
+        }
+        if (good && !done && !manner.lod && manner.keep && is_parted(array)) {
             decoded.table = std::make_shared<Chunk>();
             good = decode_part(wanted, stream, size, *decoded.table, *decoded.chunk, done, error);
         }
@@ -387,11 +422,11 @@ struct Reading {
 
     // Keeps what was decoded, and lets the caller see it.
     bool take(const Wanted& wanted, const Decoded& decoded) {
-        const bool apart = decoded.table != nullptr;
-        if (manner.keep)
-            file.cache.put(
-                {array.number, wanted.number, apart ? UNCORRECTED : uint64_t(manner.lod)},
-                apart ? decoded.table : decoded.chunk);
+        uint64_t kind = uint64_t(manner.lod);
+        std::shared_ptr<Chunk> kept = decoded.chunk;
+        if (decoded.mark) kind = APART, kept = decoded.mark;
+        else if (decoded.table) kind = UNCORRECTED, kept = decoded.table;
+        if (manner.keep) file.cache.put({array.number, wanted.number, kind}, kept);
         return wanted.ahead || visit(wanted.place, *decoded.chunk);
     }
 
