@@ -19,7 +19,7 @@ class HistoryPoint(TypedDict):
     """A point of the course of a training."""
 
     epoch: Annotated[float, "epoch, or update of the head"]
-    seconds: Annotated[float | None, "since its beginning; null with `--no-timings`"]
+    seconds: Annotated[float | None, "since its beginning; null without `--timings`"]
     psnr: Annotated[float | None, "dB on samples"]
 
 
@@ -28,7 +28,7 @@ class Gain(TypedDict):
 
     what: Annotated[str, "the part"]
     bytes: Annotated[int, "size of the file after it, estimated but for the last"]
-    seconds: NotRequired[Annotated[float, "since the search began; not with `--no-timings`"]]
+    seconds: NotRequired[Annotated[float, "since the search began; with `--timings` alone"]]
 
 
 class BulkFigures(TypedDict):

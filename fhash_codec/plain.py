@@ -6,7 +6,7 @@ Any Zarr v3 library reads every number of such a file; FORMAT.md, Plain files, s
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -33,7 +33,7 @@ from fhash_formats.container.header import (
     SPARSE,
     STEPS,
 )
-from fhash_formats.container.hierarchy import COORDINATES
+from fhash_formats.container.hierarchy import COORDINATES, SHOWN_ATTRIBUTES
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.errors import InputError
 from fhash_formats.support.files import check_output
@@ -109,7 +109,11 @@ class _Export:
         self._header = volume.container.header
         writer.begin(self._header["variable"])
         names = [coordinate.name for coordinate in volume.coords.values()]
-        writer.name_axes(names, volume.shape)
+        axes = writer.name_axes(names, volume.shape)
+        own = (len(volume.key_times.key_frames), *volume.box.shape)
+        sizes = zip(axes, own, volume.shape, strict=True)
+        # A coordinate that has positions beside those of the table names no axis of it.
+        self._axes = [axis if part == n else f"{axis}_box" for axis, part, n in sizes]
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:
@@ -171,6 +175,7 @@ class _Export:
             array,
             tables[0].dtype,
             lambda index: self._table(array, index)[..., np.newaxis],
+            self._shown(),
         )
         for table in tables[1:]:
             self._write_table(table)
@@ -238,6 +243,7 @@ class _Export:
         array: StoredArray,
         dtype: np.dtype[Any],
         read: Callable[[Index], npt.NDArray[Any]],
+        attributes: Mapping[str, Any] | None = None,
     ) -> None:
         """Write an array in the tiles of the coded one. read: gives a tile by its index."""
 
@@ -253,8 +259,16 @@ class _Export:
             dtype=dtype,
             chunk_shape=(*array.chunk_shape, *extra),
             chunks=chunks(),
-            dimension_names=TABLE_AXES[: 4 + len(extra)],
+            dimension_names=(*self._axes, *TABLE_AXES[4:])[: 4 + len(extra)],
+            attributes=attributes,
         )
+
+    def _shown(self) -> dict[str, Any]:
+        """Attributes by which libraries of Zarr show a table as that of its variable."""
+        variable = self._header["variable"]
+        attributes = {**variable["attributes"], "units": variable["units"]}
+        shown = {key: attributes[key] for key in SHOWN_ATTRIBUTES if attributes.get(key)}
+        return {"long_name": variable["name"], **shown}
 
     def _table(self, array: StoredArray, index: Index) -> npt.NDArray[Any]:
         region = chunk_region(index, array.chunk_shape, array.shape)

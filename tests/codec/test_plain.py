@@ -18,6 +18,7 @@ from fhash_codec import EncodeConfig, InputError
 from fhash_codec.plain import export_plain
 from fhash_formats.container import Container, validate_header
 from fhash_formats.errors import DamagedFileError, OutputExistsError
+from fhash_formats.series import ArraySeries, Coordinate
 
 HERE = Path(__file__).resolve().parent
 GOLDENS = [
@@ -192,6 +193,28 @@ def headed(tmp_path: Path) -> Path:
     path = with_head(tmp_path / "a.fhz", some_head())
     export_plain(path, tmp_path / "plain.fhz")
     return tmp_path / "plain.fhz"
+
+
+def test_a_plain_table_has_names_and_coordinates_of_its_variable(tmp_path: Path) -> None:
+    coords = {
+        axis: Coordinate(name=name, values=np.arange(n) * 2.5, attributes={"units": "m"})
+        for (axis, name), n in zip(
+            {"t": "time", "z": "level", "y": "lat", "x": "lon"}.items(), (3, 4, 5, 6), strict=True
+        )
+    }
+    values = np.random.default_rng(2).normal(size=(3, 4, 5, 6)).astype(np.float32)
+    series = ArraySeries(values, name="speed", units="m s-1", coords=coords)
+    fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(max_error=0.1, effort=1))
+    export_plain(tmp_path / "a.fhz", tmp_path / "plain.fhz")
+    store = zarr.storage.ZipStore(tmp_path / "plain.fhz", mode="r")
+    group = zarr.open_group(store, mode="r")
+    table = group["parts/0.tables.level_1"]
+    assert table.metadata.dimension_names == ("time", "level", "lat", "lon", "embedding")
+    assert table.attrs.asdict() == {"long_name": "speed", "units": "m s-1"}
+    for name in table.metadata.dimension_names[:4]:
+        axis = next(axis for axis, each in coords.items() if each.name == name)
+        np.testing.assert_array_equal(group[name][...], coords[axis].values)
+    store.close()
 
 
 WRONG = {

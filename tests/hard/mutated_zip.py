@@ -84,7 +84,7 @@ def _signature(chance: random.Random, parts: Parts) -> bytes:
     """Put another version or another text into the comment."""
     data, words = pack(parts), ("fhash 0", "fhash 1", "fhash 3", "fhash 9999", "fhash -", "FHASH 2")
     new = chance.choice((*words, "fhash 02")).encode()
-    other = data.replace(b"fhash 2", new)
+    other = data.replace(b"fhash 3", new)
     return other if chance.random() < 0.8 else data[:-1] + chance.randbytes(1)
 
 

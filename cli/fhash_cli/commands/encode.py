@@ -115,7 +115,7 @@ class Chosen(TypedDict, total=False):
     "--part",
     metavar="I/N",
     help="Encode only the I-th of N parts, counted from 1: whole layers of tiles along time, such "
-    "as 3/16. `fhash merge` joins the parts to what one command would write with --no-timings. "
+    "as 3/16. `fhash merge` joins the parts to what one command would write. "
     "Needs --max-error or --max-error-rel.",
 )
 @click.option(

@@ -121,7 +121,7 @@ def merge_command(
 
     Tiles are copied and their checksums checked; nothing is coded again. Parts that are missing,
     given twice or of another encoding are refused. RUN.fhz is, byte for byte, what one `fhash
-    encode` with the same settings and --no-timings writes.
+    encode` with the same settings writes.
     """
     from fhash_codec.appending.parts import merge
 

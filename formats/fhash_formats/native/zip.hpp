@@ -21,9 +21,9 @@ struct Source {
     uint64_t tail_at = 0;  // offset of `tail`
     Buffer tail;
 
-    // Tells that ranges will be read, those of more than one.
+    // Tells that ranges will be read.
     void announce(const std::vector<uint64_t>& ranges) const {
-        if (announced && ranges.size() > 2) announced(user, ranges.data(), ranges.size() / 2);
+        if (announced && !ranges.empty()) announced(user, ranges.data(), ranges.size() / 2);
     }
     bool read_tail(fhash_error& error);
     bool read(uint64_t offset, uint64_t length, uint8_t* bytes, fhash_error& error) const;

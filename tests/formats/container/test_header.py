@@ -22,7 +22,6 @@ from fhash_formats.container import (
     validate_header,
 )
 from fhash_formats.container.header import (
-    CONFIG_DEFAULTS,
     DEFAULTS,
     LOWEST,
     MASK_ARRAY,
@@ -246,7 +245,7 @@ def test_an_array_beside_a_description_is_checked_as_well(tmp_path, samples, cas
     ],
 )
 def test_wrong_description_is_named(samples, description, key) -> None:
-    header = {**samples.compact_header(), "format": "fhash", "format_version": [2, 0]}
+    header = {**samples.compact_header(), "format": "fhash", "format_version": [3, 0]}
     validate_header(header)
     header["coordinates"] = {"x": description}
     with pytest.raises(
@@ -256,14 +255,14 @@ def test_wrong_description_is_named(samples, description, key) -> None:
 
 
 def test_few_bytes_do_not_ask_for_much_memory(samples) -> None:
-    header = {**samples.compact_header(), "format": "fhash", "format_version": [2, 0]}
+    header = {**samples.compact_header(), "format": "fhash", "format_version": [3, 0]}
     header["domain"]["shape"][3] = MAX_RULED + 1
     with pytest.raises(DamagedFileError, match=r"coordinates[.]x .*an array for more than"):
         validate_header(header)
 
 
-FIXED = {"format": "fhash", "format_version": [2, 0], "required_features": []}
-VERSION = {"format": "fhash", "format_version": [2, 0]}
+FIXED = {"format": "fhash", "format_version": [3, 0], "required_features": []}
+VERSION = {"format": "fhash", "format_version": [3, 0]}
 
 
 BAD = [
@@ -382,7 +381,7 @@ def test_wrong_key_is_named(samples, path, value) -> None:
         ("history", {}),
         ("history", {"epoch": [1, 2], "seconds": [None, 0.5]}),
         ("variable.units", ""),
-        ("format_version", [2, 3]),
+        ("format_version", [3, 3]),
     ],
 )
 def test_allowed(samples, path, value) -> None:
@@ -453,13 +452,13 @@ def test_allowed_in_the_profile_compact(samples, path, value) -> None:
 
 ROOTS = {
     "newer major": (
-        ("format_version", [3, 1]),
-        "the file is of format 3.x; this version reads format 2.x: upgrade",
+        ("format_version", [4, 1]),
+        "the file is of format 4.x; this version reads format 3.x: upgrade",
         UnsupportedFileError,
     ),
     "older major": (
-        ("format_version", [1, 8]),
-        "the file is of format 1.x; this version reads format 2.x: encode the source again",
+        ("format_version", [2, 8]),
+        "the file is of format 2.x; this version reads format 3.x: encode the source again",
         UnsupportedFileError,
     ),
     "feature": (
@@ -486,7 +485,7 @@ def test_root(sample, samples, case) -> None:
 def test_newer_minor_is_read(sample, samples) -> None:
     def newer(document) -> None:
         root = document["attributes"]["fhash"]
-        root["format_version"] = [2, 7]
+        root["format_version"] = [3, 7]
         root["variables"][0]["novelty"] = {"a": 1}
 
     sample.write_bytes(edited(sample, samples, ROOT, newer))
@@ -500,9 +499,9 @@ def test_a_file_of_format_1_is_named(sample, samples) -> None:
     """Its header has no variables."""
 
     def older(document) -> None:
-        document["attributes"]["fhash"] = {"format": "fhash", "format_version": [1, 8]}
+        document["attributes"]["fhash"] = {"format": "fhash", "format_version": [2, 8]}
 
-    message = "sample.fhz: the file is of format 1.x; this version reads format 2.x: encode the"
+    message = "sample.fhz: the file is of format 2.x; this version reads format 3.x: encode the"
     refused(sample, edited(sample, samples, ROOT, older), message, UnsupportedFileError)
 
 
@@ -511,7 +510,7 @@ def test_a_brief_header_comes_back(samples) -> None:
     whole = {
         **samples.header(),
         "features": ["all"],
-        "config": {**CONFIG_DEFAULTS, "effort": 7},
+        "config": {"effort": 7},
         "training": {"seconds": None, "steps": 3, "epochs": 0, "device": "none"},
         "history": {},
         "quality": {**quality, "ssim_window": {"window": 7, "sigma": 1.5, "steps": [0]}},
@@ -532,26 +531,6 @@ def test_a_brief_header_comes_back(samples) -> None:
     assert complete(complete(short)) == before
 
 
-@pytest.mark.parametrize(
-    ("older", "preset"),
-    [
-        ({"profile": "paper"}, "published"),
-        ({"profile": "paper", "access": "fast"}, "published"),
-        ({"profile": "compact", "access": "fast"}, "fast"),
-        ({"access": "small"}, "small"),
-        ({"access": "balanced"}, "default"),
-        ({"access": ["fast"]}, "default"),
-        ({}, "default"),
-    ],
-)
-def test_settings_of_older_encoders_have_the_preset_that_they_amount_to(older, preset) -> None:
-    assert complete({"config": {"effort": 7, **older}})["config"] == {
-        **CONFIG_DEFAULTS,
-        "effort": 7,
-        "preset": preset,
-    }
-
-
 def test_a_quality_that_nobody_measured_stays_empty() -> None:
     assert complete({"quality": {}})["quality"] == {}
     assert brief({"quality": {"ssim_window": {}}}) == {"quality": {"ssim_window": {}}}
@@ -561,9 +540,8 @@ def test_values_of_another_form_stay() -> None:
     odd = {"config": 5, "training": [1], "features": None, "history": {"epoch": []}, "quality": 3}
     whole = complete(odd)
     assert {key: whole[key] for key in odd} == odd
-    assert complete({})["config"] == CONFIG_DEFAULTS
-    complete({})["config"]["without"].append("ssim")
-    assert CONFIG_DEFAULTS["without"] == DEFAULTS["config"]["without"] == []
+    complete({})["features"].append("isosurface:1")
+    assert DEFAULTS["features"] == ["all"]
 
 
 @pytest.mark.parametrize(

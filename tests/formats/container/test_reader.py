@@ -274,7 +274,7 @@ def test_is_container(sample, tmp_path) -> None:
         b"",
         b"PK\x05\x06" + bytes(18),
         b"\x89HDF\r\n\x1a\n" + bytes(500),
-        b"fhash 2 sha256=" + b"0" * 64,
+        b"fhash 3 sha256=" + b"0" * 64,
     ],
 )
 def test_another_file_is_refused(tmp_path, content) -> None:

@@ -208,7 +208,7 @@ def test_bytes_of_a_far_directory_entry() -> None:
 def test_comment_is_a_digest() -> None:
     assert (
         comment(b"")
-        == b"fhash 2 sha256=e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+        == b"fhash 3 sha256=e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     )
 
 
@@ -463,13 +463,13 @@ def test_end_record(sample, samples, field, form, value, message) -> None:
 
 
 @pytest.mark.parametrize(
-    ("major", "advice"), [(b"1", "encode the source again"), (b"3", "upgrade")]
+    ("major", "advice"), [(b"2", "encode the source again"), (b"4", "upgrade")]
 )
 def test_another_format(sample, major, advice) -> None:
     data = sample.read_bytes()
     refused(
         sample,
-        data.replace(b"fhash 2 sha256", b"fhash %s sha256" % major),
-        rf"of format {major.decode()}\.x; this version reads format 2\.x: {advice}",
+        data.replace(b"fhash 3 sha256", b"fhash %s sha256" % major),
+        rf"of format {major.decode()}\.x; this version reads format 3\.x: {advice}",
         UnsupportedFileError,
     )
