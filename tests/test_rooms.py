@@ -37,7 +37,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "fhash_formats.container": (
         ("record", "zip_file"),
-        ("array", "header", "native_file", "remote"),
+        ("array", "header", "remote"),
         ("source_entry", "stored"),
         ("hierarchy",),
         ("reader",),

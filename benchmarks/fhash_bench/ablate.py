@@ -10,7 +10,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -509,7 +509,7 @@ def _encoded(series: Series, path: Path, config: EncodeConfig) -> dict[str, Any]
         # What a variation does badly is what the table is to show.
         warnings.simplefilter("ignore", FhashWarning)
         try:
-            figures = encode(series, path, config, force=True)
+            figures = encode(series, path, replace(config, timings=True), force=True)
         except QualityError as error:
             figures = error.figures
         finally:

@@ -153,7 +153,8 @@ class OwnEncodings:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FhashWarning)
-                report = encode(self._series, path, config, force=True, progress=guarded)
+                timed = replace(config, timings=True)  # for the course of the training
+                report = encode(self._series, path, timed, force=True, progress=guarded)
         except QualityError as error:
             report, missed = error.figures, True
         except InterruptedEncodingError:  # a training turns Ctrl-C into this

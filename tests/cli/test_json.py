@@ -80,13 +80,14 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     with h5py.File(data) as file:
         smallest = file["density"][...].min()
     for settings in (
-        ["--effort", "2"],
-        ["--effort", "2", "--no-timings", "--missing", repr(float(smallest))],
+        ["--effort", "2", "--timings"],
+        ["--effort", "2", "--missing", repr(float(smallest))],
         *(
             [
                 "--preset=published",
                 "--tables=float16",
                 "--epochs=1",
+                "--timings",
                 "--width=4",
                 "--key-frames=0,2",
             ],
@@ -138,7 +139,7 @@ def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     def encode_fast(*words: Any, **options: Any) -> dict[str, Any]:
         *files, config = words
-        return encode(*files, replace(config, effort=2), **options)
+        return encode(*files, replace(config, effort=2, timings=True), **options)
 
     monkeypatch.setattr(fhash_codec, "encode", encode_fast)
     words = ("demo", "--shape", "8,10,12", "--steps", "5", "--explain", "--json", "-q", "-o")

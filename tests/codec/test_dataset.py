@@ -407,7 +407,12 @@ def test_layers_beyond_the_cache_are_decoded_together(
 def test_the_figures_are_those_of_the_file(field, tmp_path) -> None:
     source = field()
     config = EncodeConfig(
-        preset="published", tables="float16", features=("interval:50:200",), epochs=8, width=16
+        preset="published",
+        tables="float16",
+        features=("interval:50:200",),
+        epochs=8,
+        width=16,
+        timings=True,
     )
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:

@@ -129,7 +129,7 @@ def test_both_models_and_plain_files_keep_everything(tmp_path, config) -> None:
 def test_history_has_the_date_where_times_are_kept(tmp_path) -> None:
     source = plain_file(tmp_path / "a.nc")
     config = EncodeConfig(
-        effort=1, max_error=0.5, features=("interval:270:280", "interval:281:300")
+        effort=1, max_error=0.5, features=("interval:270:280", "interval:281:300"), timings=True
     )
     fhash_codec.encode(source, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:

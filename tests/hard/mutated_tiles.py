@@ -230,7 +230,8 @@ def _index(chance: random.Random, parts: Parts) -> Parts:
     if not is_sharded(file.arrays[name]):
         raise NothingFitsError
     data = dict(parts)[member]
-    start = len(data) - inner_chunks(file.arrays[name], member, data)[0].index_bytes
+    _, present, _ = inner_chunks(file.arrays[name], member, data)
+    start = len(data) - present.size * ENTRY_BYTES - 4
     table = list(struct.unpack(f"<{(len(data) - start - 4) // 8}Q", data[start:-4]))
     for _ in range(chance.choice((1, 1, 2))):
         at = chance.randrange(len(table))

@@ -2,12 +2,9 @@
 
 FORMAT.md beside this package is the normative description.
 
-A container uses a small fixed subset of Zarr v3. This package reads and writes the subset itself
-and not through the zarr library, for three reasons:
-
-- arrays are streamed to the file chunk by chunk, so that no second copy is held in memory;
-- a hostile file is checked before anything is allocated;
-- 0.4 ms per chunk are saved.
+A container uses a small fixed subset of Zarr v3. libfhash reads it, as in C and in the browser:
+a hostile file is checked before anything is allocated. This package writes it, and not the zarr
+library: arrays are streamed to the file chunk by chunk, without a second copy in memory.
 
 The tests prove that the zarr library reads every array equal.
 
@@ -17,15 +14,14 @@ The tests prove that the zarr library reads every array equal.
     array         metadata of one array, values of a chunk <-> bytes, many chunks in one member
     header        checks of the header, and the positions in it
     source_entry  what belongs to the variable in its source <-> header and arrays
-    hierarchy     members of the ZIP -> headers and arrays
-    stored        StoredArray: one array, read region by region
+    hierarchy     names of arrays in the hierarchy, headers in its root
+    stored        NativeFile: a file that libfhash reads; StoredArray: one of its arrays
     reader        Container: a file for reading
     writer        ContainerWriter: a file for writing
     growing       GrowingContainer: a file that is complete after each layer
 
 Only `array` and `growing` know of the codec of tiles in `transform`, and `header` and `reader` of
-the shape of its head. No reader of other formats and
-no writer of regions is imported here.
+the shape of its head. No reader of other formats and no writer of regions is imported here.
 """
 
 from fhash_formats.container.array import shard_order, shard_shape

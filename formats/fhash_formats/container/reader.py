@@ -35,10 +35,9 @@ from fhash_formats.container.hierarchy import (
     read_headers,
     variable_named,
 )
-from fhash_formats.container.native_file import NativeFile
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.source_entry import AUXILIARY, check_source
-from fhash_formats.container.stored import StoredArray
+from fhash_formats.container.stored import NativeFile, StoredArray
 from fhash_formats.container.zip_file import (
     CountedSource,
     FileSource,

@@ -114,12 +114,14 @@ class RemoteSource(Source):
         # An iterator may wait for a lock that a reader holds: it ends before this lock is taken.
         places, thread = list(ranges), threading.get_ident()
         with self._lock:
-            for fetch in [fetch for fetch in self._waiting if fetch.thread == thread]:
-                self._waiting.remove(fetch)
-                self._forget(fetch)
             in_tail = self._tail_start
             before = {(offset, min(size, in_tail - offset)) for offset, size in places}
             new = [place for place in before if place[1] > 0 and self._known(place) is None]
+            if not new:
+                return
+            for fetch in [fetch for fetch in self._waiting if fetch.thread == thread]:
+                self._waiting.remove(fetch)
+                self._forget(fetch)
             fetches = [_Fetch(request, thread) for request in merged(new, GAP, REQUEST_BYTES)]
             for fetch in fetches:
                 self._fetches.update(dict.fromkeys(fetch.request.ranges, fetch))

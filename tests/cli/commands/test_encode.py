@@ -23,20 +23,20 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
     words = ["encode", data, "-o", tmp_path / "run.fhz", "--effort", "2", "--force", "-q"]
-    report = json.loads(fhash(*words, "--json").stdout)
+    report = json.loads(fhash(*words, "--timings", "--json").stdout)
     assert report["published"] is False
     assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(
         report["gains"]
     )
-    lines = fhash(*words, "-v").stdout.splitlines()
+    lines = fhash(*words, "--timings", "-v").stdout.splitlines()
     brief = fhash(*words).stdout.splitlines()
     for gain in report["gains"]:
         assert sum(line.startswith(f"  {gain['what']}  ") for line in lines) == 1
         assert not any(line.startswith(f"  {gain['what']}  ") for line in brief)
     assert not any("key frames" in line or "epochs" in line for line in lines)
-    bare = json.loads(fhash(*words, "--no-timings", "--json").stdout)
+    bare = json.loads(fhash(*words, "--json").stdout)
     assert [set(gain) for gain in bare["gains"]] == [{"what", "bytes"}] * len(report["gains"])
-    assert fhash(*words, "--no-timings", "-v").exit_code == 0
+    assert fhash(*words, "-v").exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run.fhz"
-    words = ("encode", data, "-o", run, "--psnr", "40", "--force")
+    words = ("encode", data, "-o", run, "--psnr", "40", "--force", "--timings")
     result = fhash(*words, "--time-budget", "10m", "--effort", "2")
     assert result.exit_code == 0
     assert "time budget 600 s: --effort 2, predicted to take" in result.stderr

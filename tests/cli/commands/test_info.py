@@ -62,7 +62,7 @@ def test_the_card_names_every_part_with_its_place(fhash: Fhash, name: str, said:
     ]
     assert full.count("\n  level ") == len(card["tables"])
     assert full.count("\n  layer ") == len(card["mlp"])
-    assert "\n  learning_rate  " in full
+    assert "\n  features  " in full
     assert "\n  level " not in short
 
 

@@ -535,7 +535,7 @@ def test_options_give_the_encoding_again() -> None:
         options_of(network.config)
         == "--preset published --feature 'mask:a b.npy' --feature isosurface:5"
     )
-    assert options_of(EncodeConfig(timings=False)) == "--no-timings"
+    assert options_of(EncodeConfig(timings=True)) == "--timings"
 
 
 def point(name: str, codec: str, seconds: float | None, size: int, psnr: float | None) -> Encoded:

@@ -492,7 +492,7 @@ def test_newer_minor_is_read(sample, samples) -> None:
     read_everything(sample)
     with Container.open(sample) as container:
         assert container.header["novelty"] == {"a": 1}
-        assert container.header["format_version"] == [2, 7]
+        assert container.header["format_version"] == [3, 7]
 
 
 def test_a_file_of_format_1_is_named(sample, samples) -> None:

@@ -23,7 +23,7 @@ from sharded_files import NAME, PATH, random_values, write_sharded
 
 from fhash_formats.container import Container
 from fhash_formats.container.array import ArrayMetadata, plain_codecs
-from fhash_formats.container.native_file import NativeFile
+from fhash_formats.container.stored import NativeFile
 from fhash_formats.container.zip_file import (
     FileSource,
     Member,

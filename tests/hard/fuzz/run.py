@@ -70,6 +70,9 @@ SOURCES = (
         "encode",
         "chunk",
         "part",
+        "region",
+        "blocks",
+        "cut",
     ),
     "files",
 )
