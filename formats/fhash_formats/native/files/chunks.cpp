@@ -24,6 +24,12 @@ constexpr uint64_t APART = 1002;           // likewise: how many parts of a tile
 constexpr int64_t MOST_APART = 3;          // then all of it is decoded
 constexpr int FLAGS = 4, KIND = 7, BLOCKS = 6;  // of a stream: place and bits of the kind
 
+#if defined(FHASH_SMALL)
+constexpr bool WHOLE = true;  // the page draws whole frames of tiles: it needs no parts of them
+#else
+constexpr bool WHOLE = false;
+#endif
+
 // An inner chunk that is to be read.
 struct Wanted {
     Lengths place;
@@ -402,7 +408,7 @@ struct Reading {
         const size_t size = size_t(wanted.stored.length - wanted.stored.skip);
         bool done = false, good = true;
         decoded.chunk = std::make_shared<Chunk>();
-        if (!manner.lod && manner.keep && is_boxed(array)) {
+        if (!WHOLE && !manner.lod && manner.keep && is_boxed(array)) {
             good = decode_region(wanted, stream, size, decoded, error);
             done = decoded.mark != nullptr;
         }
@@ -672,7 +678,7 @@ bool visit_chunks(fhash_file& file, const Array& array, const Region& region, co
     if (!grid.each(grid.first, grid.last, look)) return false;
     Indices indices{file, array};
     if (!wanted.empty() && !indices.locate_all(wanted, error)) return false;
-    if (manner.ahead) add_ahead(file, grid, indices, wanted);
+    if (!WHOLE && manner.ahead) add_ahead(file, grid, indices, wanted);
     return wanted.empty() || Reading{file, array, region, manner, visit}.read(wanted, error);
 }
 
