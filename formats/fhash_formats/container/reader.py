@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import pairwise
@@ -253,6 +253,7 @@ class Container:
     arrays: Mapping[str, StoredArray]
     variables: Mapping[str, VariableContainer] = MappingProxyType({})
     variable: str | None = None
+    _documents: Sequence[int]
 
     def __init__(self, path: Path | str, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
         """Read a container from an open source, which `close` closes; `open` is for files.
@@ -274,7 +275,7 @@ class Container:
         """Take the header and the arrays of the file."""
         file, self.digest = self._file, self._file.digest
         nodes = file.nodes()
-        self._documents = len(nodes)
+        self._documents = range(len(nodes))
         root = next(node for node in nodes if not node.path)
         self.header_bytes = root.document_bytes
         attributes = json.loads(root.text)["attributes"]
@@ -388,8 +389,8 @@ class Container:
         `progress(done, total)` counts metadata documents, as read already, and chunks. Raises
         DamagedFileError that names the member.
         """
-        total = self._documents + sum(prod(array.grid) for array in self.arrays.values())
-        done = self._documents
+        total = len(self._documents) + sum(prod(array.grid) for array in self.arrays.values())
+        done = len(self._documents)
 
         def count() -> None:
             nonlocal done
@@ -398,6 +399,8 @@ class Container:
                 progress(done, total)
 
         with damage_named(self.path, self._source):
+            for place in self._documents:
+                self._file.check_document(place)
             for array in self.arrays.values():
                 array.verify(count)
         return len(self.arrays)
@@ -489,7 +492,7 @@ class VariableContainer(Container):
         self.cache_bytes = file.cache_bytes
         self.arrays = MappingProxyType(dict(arrays))
         self.digest = sha256(f"{file.digest}/{self.variable}".encode()).hexdigest()
-        self._container, self._source = file, file._source
+        self._container, self._source, self._file = file, file._source, file._file
         self._closes_file = False
         shared = [name for name in header.get(SHARES, ()) if not name.startswith(AUXILIARY)]
         begin, table = f"{PARTS}/{number}.", header.get(ARRAY)
@@ -499,7 +502,7 @@ class VariableContainer(Container):
             if name in shared or array.name.startswith(begin) or array.name == table
         ]
         self.size = sum(arrays[name].place_bytes for name in self._own)
-        self._documents = len(self._own)
+        self._documents = [arrays[name].place_of_document for name in self._own]
 
     def closing_file(self) -> VariableContainer:
         """Itself, from now on with a `close` that closes the file, and so all variables."""

@@ -38,7 +38,7 @@ __all__ = [
     "pointer",
 ]
 
-ABI_VERSION = 27
+ABI_VERSION = 28
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 FOLDER = Path(__file__).parent
 """Folder of libfhash with its header and build files; also that of HDF5's plugin, libfhash."""

@@ -10,7 +10,7 @@
 
 // ABI number. Raise it whenever the signature or the meaning of a function of functions.h changes;
 // native/__init__.py holds the same number.
-constexpr std::int64_t FHASH_ABI = 27;
+constexpr std::int64_t FHASH_ABI = 28;
 
 // FHASH_KERNEL before a function that fhash_function finds by its name; others do not see it.
 #define FHASH_KERNEL extern "C"

@@ -85,7 +85,8 @@ typedef struct fhash_chunk {
     void* owner;
 } fhash_chunk;
 
-/* arrays.cpp: nodes and arrays of an open file. An array is told by its number. */
+/* Nodes and arrays of an open file. An array is told by its number. */
+/* arrays.cpp */
 int32_t fhash_file_open(fhash_context* context, fhash_read_function read,
                         fhash_announce_function announce, void* user, uint64_t size,
                         fhash_file** file, fhash_error* error);
@@ -94,6 +95,7 @@ int32_t fhash_file_with(fhash_context* context, const fhash_file* file, fhash_fi
 int32_t fhash_file_node(const fhash_file* file, int64_t number, fhash_node* node);
 int32_t fhash_file_place(const fhash_file* file, int32_t variable, int64_t number,
                          const char** name, int64_t* array);
+int32_t fhash_file_check(const fhash_file* file, int64_t number, fhash_error* error);
 int32_t fhash_file_digest(const fhash_file* file, char* digest);
 int32_t fhash_file_cache(const fhash_file* file, uint64_t bytes);
 int32_t fhash_array_read(fhash_file* file, int64_t array, const int64_t* bounds, int32_t keep,
@@ -203,12 +205,6 @@ int32_t fhash_tile_table(fhash_context* context, const fhash_tile* tile, const v
 int32_t fhash_tile_uncorrected(fhash_context* context, const fhash_tile* tile, const void* stream,
                                size_t size, const int64_t* part, float* values, int32_t* done,
                                fhash_error* error);
-/* region.cpp */
-int32_t fhash_tile_region(fhash_context* context, const fhash_tile* tile, const void* stream,
-                          size_t size, const int64_t* part, void* values, int32_t* done,
-                          fhash_error* error);
-
-/* part.cpp */
 int32_t fhash_tile_part(fhash_context* context, const fhash_tile* tile, const float* table,
                         const int64_t* part, void* values, fhash_error* error);
 int32_t fhash_tile_foretold(fhash_context* context, const fhash_tile* tile, const int32_t* integers,
@@ -246,6 +242,11 @@ int64_t fhash_dequantise_f32(const int32_t* in, int64_t n, double step, const do
                              float* out);
 int64_t fhash_dequantise_f64(const int32_t* in, int64_t n, double step, const double* shifts,
                              double* out);
+
+/* region.cpp */
+int32_t fhash_tile_region(fhash_context* context, const fhash_tile* tile, const void* stream,
+                          size_t size, const int64_t* part, void* values, int32_t* done,
+                          fhash_error* error);
 
 /* trellis.cpp */
 int64_t fhash_trellis_count(const int32_t* levels, const int64_t* shape, const int32_t* table,

@@ -6,6 +6,7 @@ import copy
 import json
 import random
 import tracemalloc
+import zipfile
 from dataclasses import replace
 from typing import Any
 
@@ -339,6 +340,23 @@ def test_arrays_that_belong_to_no_variable(tmp_path, samples, name, message) -> 
     root["consolidated_metadata"]["metadata"][name] = json.loads(document)
     data = samples.pack([*copies, *parts[:-1], (ROOT, json.dumps(root).encode())])
     refused(path, data, message)
+
+
+def test_a_document_that_the_root_repeats_is_checked_as_well(tmp_path, samples) -> None:
+    """It is not read at opening; a library of Zarr may read it."""
+    path = write_several(tmp_path / "a.fhz", samples)
+    with zipfile.ZipFile(path) as file:
+        documents = [each for each in file.infolist() if each.filename.endswith("/zarr.json")]
+    sound = path.read_bytes()
+    for each in documents:
+        damaged = bytearray(sound)
+        damaged[each.header_offset + 30 + len(each.filename) + each.compress_size // 2] ^= 4
+        path.write_bytes(damaged)
+        with (
+            pytest.raises(DamagedFileError, match=f"member {each.filename}: "),
+            Container.open(path) as container,
+        ):
+            container.verify()
 
 
 def test_a_missing_chunk_of_any_variable_is_refused(tmp_path, samples) -> None:

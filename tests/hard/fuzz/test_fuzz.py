@@ -29,6 +29,15 @@ NOT_FUZZED = {
     **dict.fromkeys(("fhash_abi_version", "fhash_codec_abi_version"), "takes nothing"),
     "fhash_network_abi_version": "takes nothing",
     "fhash_between": "takes frames that Python or a file has decoded; files are fuzzed",
+    **dict.fromkeys(
+        (
+            *(f"fhash_file_{name}" for name in ("open", "with", "node", "place", "cache")),
+            *(f"fhash_file_{name}" for name in ("check", "digest")),
+            *(f"fhash_array_{name}" for name in ("read", "chunk", "stored", "announce", "check")),
+            "fhash_chunk_free",
+        ),
+        "reads files as fhash_open and fhash_read do, which are fuzzed; hostile files try it",
+    ),
     "fhash_price": "takes coefficients of the planner, any floats",
     "fhash_plan": "takes the caller's own values, by arrays that Python alone makes",
     **dict.fromkeys(("fhash_network_fma", "fhash_network_copy"), "for benchmarks alone"),
@@ -106,7 +115,7 @@ def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "quantise.cpp").write_text(
         source.replace(loop, loop.replace("i < count", "i <= count")), encoding="utf-8"
     )
-    for header in run.NATIVE.glob("*.hpp"):
+    for header in (*run.NATIVE.glob("*.hpp"), *run.NATIVE.glob("*.h")):
         shutil.copy(header, tmp_path)
     monkeypatch.setattr(run, "NATIVE", tmp_path)
     monkeypatch.setattr(run, "SOURCES", ("quantise",))
