@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
@@ -44,7 +44,6 @@ from fhash_formats.container.header import (
 from fhash_formats.errors import InputError
 from fhash_formats.series import (
     AXES,
-    AXIS_NAMES,
     Coordinate,
     Series,
     SourceMetadata,
@@ -373,11 +372,9 @@ def write_series(
     *,
     everything: bool = False,
 ) -> dict[str, Any]:
-    """Write coordinates, key frames, and masks of the values that are not finite.
+    """Write key frames, arrays beside the values, and masks of the values that are not finite.
 
-    The writer begins the variable of the series. Each array that the header can say in fewer bytes
-    is left out, but for the coordinates of one of several variables, which share their arrays.
-    Returns the header's `coordinates`, which stand for these arrays.
+    The writer begins the variable of the series. Returns the header's `coordinates`.
 
     Args:
         writer: of the container.
@@ -388,37 +385,15 @@ def write_series(
             step is a key frame: all others are in it, and are read from there.
     """
     coords = _storable_coords(series)
-    writer.begin(describe_variable(series))
-    described = {}
-    if not writer.one_of_several:
-        names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
-        described = describe_coordinates(coords, names)
+    writer.begin()
     for name, array in described_source(series, coords, {})[1].items():
         writer.add_whole(name, array)
-    write_coordinates(writer, coords, described)
     every_step = len(key_frames) == series.shape[0]
     if not every_step:
         writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
     if scanned.missing and not (everything and every_step):
         write_missing(writer, series.shape, scanned)
-    return {"coordinates": described}
-
-
-def write_coordinates(
-    writer: ContainerWriter, coords: Mapping[str, Coordinate], described: Collection[str] = ()
-) -> None:
-    """Write an array for each axis whose positions do not stand in the header.
-
-    coords: a coordinate for each of "t", "z", "y" and "x". described: the axes in the header.
-    """
-    for axis, stored in AXIS_NAMES.items():
-        if stored not in described:
-            coordinate = coords[axis]
-            writer.add_whole(
-                f"coords/{stored}",
-                coordinate.values,
-                attributes={**coordinate.attributes, "name": coordinate.name},
-            )
+    return {"coordinates": describe_coordinates(coords)}
 
 
 def _storable_coords(series: Series) -> dict[str, Coordinate]:

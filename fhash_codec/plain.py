@@ -6,6 +6,7 @@ Any Zarr v3 library reads every number of such a file; FORMAT.md, Plain files, s
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from math import prod
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import TABLE_AXES, Box, Table
 from fhash_codec.compact.model import correction_of, predicted
 from fhash_codec.features.occupancy import pack, packed_bytes, write_bits
-from fhash_codec.header import check_name, write_coordinates
+from fhash_codec.header import check_name
 from fhash_codec.measure.value_range import decoded_type
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
@@ -28,12 +29,12 @@ from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.header import (
     BITS_ARRAY,
     LAYERS,
-    MASK_ARRAY,
+    MISSING_ARRAY,
     PLAIN_FEATURE,
     SPARSE,
     STEPS,
 )
-from fhash_formats.container.hierarchy import COORDINATES, SHOWN_ATTRIBUTES
+from fhash_formats.container.hierarchy import SHOWN_ATTRIBUTES
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.errors import InputError
 from fhash_formats.support.files import check_output
@@ -107,11 +108,10 @@ class _Export:
         self._volume, self._writer, self._progress = volume, writer, progress
         self._arrays = volume.container.arrays
         self._header = volume.container.header
-        writer.begin(self._header["variable"])
-        names = [coordinate.name for coordinate in volume.coords.values()]
-        axes = writer.name_axes(names, volume.shape)
+        writer.begin()
+        self._names = [_node(each.name, axis) for axis, each in volume.coords.items()]
         own = (len(volume.key_times.key_frames), *volume.box.shape)
-        sizes = zip(axes, own, volume.shape, strict=True)
+        sizes = zip(self._names, own, volume.shape, strict=True)
         # A coordinate that has positions beside those of the table names no axis of it.
         self._axes = [axis if part == n else f"{axis}_box" for axis, part, n in sizes]
         self._done, self._total = 0, 1
@@ -126,16 +126,15 @@ class _Export:
             if SPARSE in model or f"tables/level_{table.level}" not in self._arrays
         ]
         levels = (f"tables/level_{table.level}/" for table in coded)
-        rewritten = (*levels, f"{MASK_ARRAY}/", f"{LAYERS}/")
+        rewritten = (*levels, f"{LAYERS}/")
         copied = {
             name: array
             for name, array in self._arrays.items()
-            if not f"{name}/".startswith((*rewritten, COORDINATES))
+            if not f"{name}/".startswith(rewritten)
         }
-        keys = len(self._volume.key_times.key_frames) if MASK_ARRAY in self._arrays else 0
-        self._total = sum(prod(array.grid) for array in copied.values()) + keys
+        self._total = sum(prod(array.grid) for array in copied.values())
         self._total += sum(map(_chunk_count, coded))
-        write_coordinates(self._writer, self._volume.coords)
+        self._write_coordinates()
         for name, array in copied.items():
             self._copy(name, array)
         if LAYERS in self._arrays:
@@ -144,8 +143,6 @@ class _Export:
                     self._writer.add_whole(f"mlp/{name}_{number}", values)
         for table in coded:
             self._write_table(table)
-        if keys:
-            self._write_occupancy(keys)
         tables, mlp = self._volume.tables, self._volume.mlp
         changed = {
             "tables": coded[0].dtype.name if coded else model["tables"],
@@ -153,7 +150,6 @@ class _Export:
         }
         return {
             **self._header,
-            "coordinates": {},
             "model": {key: model[key] for key in model if key != SPARSE} | changed,
             "required_features": [],  # tables that are numbers need none
         }
@@ -184,7 +180,6 @@ class _Export:
         self._write_corrections(array, head)
         return {
             **self._header,
-            "coordinates": {},
             "required_features": [PLAIN_FEATURE],
             "model": {
                 **self._header["model"],
@@ -276,14 +271,23 @@ class _Export:
         # Tiles with settings of their own may each have another working type.
         return table.astype(self._volume.tables[0].dtype, copy=False)
 
+    def _write_coordinates(self) -> None:
+        """Write positions as arrays for libraries of Zarr too; readers take those of the header."""
+        coords = self._volume.coords.values()
+        for name, coordinate in zip(self._names, coords, strict=True):
+            attributes = dict(coordinate.attributes)
+            self._writer.add_whole(
+                name, coordinate.values, dimension_names=[name], attributes=attributes
+            )
+
     def _write_axes(self) -> None:
-        """Write positions and key frames as arrays, and arrays of the source beside the values."""
-        write_coordinates(self._writer, self._volume.coords)
+        """Write key frames, and arrays of the source beside the values."""
+        self._write_coordinates()
         key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
         self._writer.add_whole("key_frames", key_frames)
         for name, array in self._arrays.items():
             # masks, figures of steps, and what belongs to the variable in its source
-            if name in ("missing/bits", STEPS) or name.startswith(AUXILIARY):
+            if name in (MISSING_ARRAY, STEPS) or name.startswith(AUXILIARY):
                 self._total += prod(array.grid)
                 self._copy(name, array)
 
@@ -339,6 +343,13 @@ class _Export:
         self._write_tiles("corrections", array, decoded_type(array.dtype), read)
         if not needed:
             self._writer.rewind(mark)
+
+
+def _node(name: str, axis: str) -> str:
+    """The name of the array of a coordinate: its own where that is one and no part's."""
+    taken = {BITS_ARRAY, MISSING_ARRAY, STEPS, "key_frames", "corrections", "tables", "mlp"}
+    allowed = re.fullmatch(r"[A-Za-z0-9-][A-Za-z0-9_-]{0,80}", name) and name not in taken
+    return name if allowed else f"axis_{axis}"
 
 
 def _described(head: NeighbourHead | None) -> dict[str, Any] | None:

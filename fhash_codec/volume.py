@@ -28,7 +28,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
 from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
-from fhash_formats.container.header import EVERYTHING
+from fhash_formats.container.header import EVERYTHING, MISSING_ARRAY
 from fhash_formats.errors import InputError, MissingDependencyError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
@@ -76,7 +76,7 @@ class ValueType:
             source=source,
             floats=decoded_type(source),
             own=source if stored_as_integers else decoded_type(source),
-            has_gaps=_has_gaps(header) or "missing/bits" in container.arrays,
+            has_gaps=_has_gaps(header) or MISSING_ARRAY in container.arrays,
             fill=variable.get("fill"),
         )
 

@@ -16,7 +16,7 @@ from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
 from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
-from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, TABLE
+from fhash_formats.container.header import BITS_ARRAY, LAYERS, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.values import Mask
@@ -169,9 +169,8 @@ class Card:
         arrays = self.container.arrays
         names = [str(name) for name in self.container.header["features"]]
         apart = names if self.profile == "paper" and len(names) > 1 else []
-        for name in (MASK_ARRAY, BITS_ARRAY):
-            if name in arrays:
-                return {"shape": shape, **self._stored(name, ""), "apart": apart}
+        if BITS_ARRAY in arrays:
+            return {"shape": shape, **self._stored(BITS_ARRAY, ""), "apart": apart}
         masked = self.container.arrays[TABLE].masked
         coding = f"in the tiles of {self._table_path}" if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}

@@ -29,7 +29,7 @@ from fhash_codec.compact.tiles import (
     padded_tile,
 )
 from fhash_codec.config import EncodeConfig
-from fhash_codec.header import brief_quality, full_header, write_coordinates
+from fhash_codec.header import brief_quality, full_header
 from fhash_codec.measure.errors import Errors, ErrorSums, error_sums
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_formats.container import (
@@ -41,10 +41,17 @@ from fhash_formats.container import (
 )
 from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
-from fhash_formats.container.header import COMPACT, NOT_STORED, PLAIN_FEATURE, STEPS, TABLE
+from fhash_formats.container.header import (
+    COMPACT,
+    MISSING_ARRAY,
+    NOT_STORED,
+    PLAIN_FEATURE,
+    STEPS,
+    TABLE,
+)
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
+from fhash_formats.series import AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
 from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import PACKING, Values, exact_number, is_within
 from fhash_formats.transform.tile import TRELLIS_WEIGHT, WEIGHT, CodedTile, decode_tile
@@ -272,7 +279,7 @@ class GrowingFile:
         self._range: ValueRange | None = None
         self._container = GrowingContainer(path, force=force, continues=continues)
         frame = tuple(coords[axis].values.size for axis in ("z", "y", "x"))
-        self._name(frame)
+        self._container.begin()
         self._array = GrowingArray(
             name=TABLE,
             frame=frame,
@@ -347,18 +354,10 @@ class GrowingFile:
     def publish(self) -> None:
         """Make the file complete, with the layers so far."""
         mark = self._container.mark()
-        names = self._name(self._array.frame)
+        self._container.begin()
         self._container.describe(self._array, self.steps)
-        coords = {**self._coords, "t": self.time}
-        described = describe_coordinates(coords, names)
-        write_coordinates(self._container, coords, described)
+        described = describe_coordinates({**self._coords, "t": self.time})
         self._container.publish(self._full_header(described), mark)
-
-    def _name(self, frame: Sequence[int]) -> list[str]:
-        """Name the arrays; the names of the axes, which stay the same for any number of steps."""
-        self._container.begin(self._header["variable"])
-        coordinates = [self._coords[axis].name for axis in AXES]
-        return self._container.name_axes(coordinates, (self.steps, *frame))
 
     @property
     def time(self) -> Coordinate:
@@ -474,7 +473,7 @@ def _settings(container: Container, header: Mapping[str, Any]) -> TileSettings:
         raise InputError(f"{path}: its tiles share no settings, by which more could be coded")
     steps, *frame = header["domain"]["shape"]
     box = [[0, n] for n in frame]
-    gaps = table.masked or header["coreset_fraction"] != 1 or "missing/bits" in container.arrays
+    gaps = table.masked or header["coreset_fraction"] != 1 or MISSING_ARRAY in container.arrays
     if gaps or header["feature_bounding_box"] != box or table.shape != (steps, *frame):
         raise InputError(
             f"{path} keeps features or has missing values or key frames; only a file that keeps "
@@ -569,7 +568,7 @@ def _copy_layers(
 ) -> None:
     """Write what is kept of a file: arrays that do not depend on time, and layers of tiles."""
     for name, array in container.arrays.items():
-        if name in (TABLE, STEPS) or name.startswith("coords/"):
+        if name in (TABLE, STEPS):
             continue
         if _follows_time(array, container):
             raise InputError(

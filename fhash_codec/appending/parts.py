@@ -39,7 +39,7 @@ from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import SOURCE, Container, ContainerWriter
 from fhash_formats.container.growing import TableParts
-from fhash_formats.container.header import EVERYTHING, NOT_STORED, TABLE
+from fhash_formats.container.header import EVERYTHING, MISSING_ARRAY, NOT_STORED, TABLE
 from fhash_formats.container.record import Record
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import DamagedFileError, InputError
@@ -51,7 +51,7 @@ from fhash_formats.transform.tile_format import TileSettings
 
 PART = "part"
 """Key of a part's header: which part it is, of how many steps of what."""
-ERRORS = "steps/errors"
+ERRORS = "step_errors"
 """Array of a part: sums of the errors of each step, of which the figures of the whole follow."""
 WHOLE = "whole/"
 """Prefix of arrays of the first part that belong to the whole series."""
@@ -637,7 +637,7 @@ class _Whole:
         """The bits of the missing values of each step that has some, where parts have an array."""
         rows: dict[int, npt.NDArray[np.uint8]] = {}
         for part in self._parts:
-            stored = part.container.arrays.get("missing/bits")
+            stored = part.container.arrays.get(MISSING_ARRAY)
             if stored is not None:
                 steps = enumerate(stored.read(), start=part.first)
                 rows.update({step: bits for step, bits in steps if bits.any()})

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container import Container, ContainerWriter
-from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY
+from fhash_formats.container.header import BITS_ARRAY
 
 CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of an array of bits. A member for each row would cost 130 bytes."""
@@ -117,7 +117,7 @@ def write_bits(
 def read_bits(
     container: Container, first: int, end: int, features: Sequence[int] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """Grids (key frames, bytes) of `occupancy/bits` from a key frame to before another.
+    """Grids (key frames, bytes) of `occupancy` from a key frame to before another.
 
     features: numbers of the features, counted from 0, whose union is taken; None for all.
     """
@@ -133,17 +133,11 @@ def read_occupancy(
 ) -> npt.NDArray[np.bool_]:
     """Mask (key frames, z, y, x) of the box from a key frame to before another.
 
-    The file has `occupancy/bits` or `occupancy/mask`. Arguments are those of `read_bits`.
+    Arguments are those of `read_bits`.
     """
     z, y, x = container.header["model"]["levels"][0][1:]
-    if MASK_ARRAY not in container.arrays:
-        return np.stack(
-            [unpack(bits, (z, y, x)) for bits in read_bits(container, first, end, features)]
-        )
-    space = (slice(0, z), slice(0, y), slice(0, x))
-    numbers = container.arrays[MASK_ARRAY].read((slice(first, end), *space))
-    chosen = range(len(container.header["features"])) if features is None else features
-    return np.asarray(numbers & np.uint8(sum(1 << number for number in set(chosen))) != 0)
+    grids = read_bits(container, first, end, features)
+    return np.stack([unpack(bits, (z, y, x)) for bits in grids])
 
 
 def _shape(mask: npt.NDArray[np.bool_]) -> Shape:

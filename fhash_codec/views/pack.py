@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from math import prod
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -24,13 +25,7 @@ from fhash_codec.header import PACKED, check_name, describe_source, write_missin
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces
 from fhash_codec.progress import Progress, silent
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.array import (
-    SINGLE_SHARD_CHUNKS,
-    TRANSFORM,
-    ArrayMetadata,
-    Codec,
-    shard_order,
-)
+from fhash_formats.container.array import SINGLE_MEMBER_TILES, TRANSFORM, ArrayMetadata, Codec
 from fhash_formats.container.header import TABLE
 from fhash_formats.errors import DamagedFileError, FhashWarning, InputError, MissingInputError
 from fhash_formats.readers.file_series import FileSeries, Request, selection
@@ -41,8 +36,8 @@ from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 from fhash_formats.support.values import exact_number, json_attributes
 from fhash_formats.transform.tile import encode_chunk
 
-SHARD_BYTES = 1 << 30
-"""Decoded bytes of a shard at most; its coded bytes, which are fewer, are held together."""
+TOGETHER_BYTES = 1 << 30
+"""Decoded bytes of a member at most; its coded bytes, which are fewer, are held together."""
 AHEAD = 2
 """Chunks that are read and decoded ahead, for each thread."""
 
@@ -152,9 +147,12 @@ class Tiles:
         codec: Codec = {"name": TRANSFORM, "configuration": array.configuration}
         self.codecs: list[Codec] = [codec]
         self.metadata = ArrayMetadata(
-            shape=array.shape, dtype=array.dtype, chunk_shape=array.tile, codecs=self.codecs
+            shape=array.shape,
+            dtype=array.dtype,
+            chunk_shape=array.tile,
+            codecs=self.codecs,
+            together=_together(array.tile, array.grid, array.dtype.itemsize),
         )
-        self.shard = _shard_shape(array.tile, array.grid, array.dtype.itemsize)
         self.facts = Facts(shape=array.shape)
 
     def __len__(self) -> int:
@@ -166,16 +164,18 @@ class Tiles:
         Raises DamagedFileError for a chunk that does not decode, and InputError for infinities and
         for a chunk that the store lacks, unless its fill value is taken.
         """
-        array = self._array
-        order = shard_order(array.shape, array.tile, self.shard or array.tile)
         with thread_pool() as pool:
-            looks = map_ahead(pool, self._look, order, AHEAD * usable_threads())
-            again = shard_order(array.shape, array.tile, self.shard or array.tile)
-            for number, (index, look) in enumerate(zip(again, looks, strict=True), start=1):
-                self.facts.add(look, self.metadata.inner_region(index))
+            looks = map_ahead(pool, self._look, self._order(), AHEAD * usable_threads())
+            for number, (index, look) in enumerate(zip(self._order(), looks, strict=True), start=1):
+                self.facts.add(look, self.metadata.region(index))
                 told(number)
                 yield look.stream
         self.facts.flush()
+
+    def _order(self) -> Iterator[Index]:
+        """Yield the tiles in the order of the file."""
+        for member in product(*map(range, self.metadata.members)):
+            yield from self.metadata.chunks_of(member)
 
     def check_against_store(self) -> None:
         """Compare the first and the last tile with what zarr decodes from the store.
@@ -210,7 +210,7 @@ class Tiles:
 
     def _inside(self, index: Index) -> tuple[slice, ...]:
         """The part of a tile within the array."""
-        region = self.metadata.inner_region(index)
+        region = self.metadata.region(index)
         return tuple(slice(0, along.stop - along.start) for along in region)
 
     def _decode(self, stream: bytes) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
@@ -268,20 +268,18 @@ def _missing(values: npt.NDArray[Any], fills: Sequence[Any]) -> npt.NDArray[np.b
     return found if found.any() else None
 
 
-def _shard_shape(tile: Index, grid: Index, itemsize: int) -> Index | None:
-    """The shape of shards of a bounded size, such that tiles come in the order of their steps.
+def _together(tile: Index, grid: Index, itemsize: int) -> Index:
+    """How many tiles along each axis lie in a member, such that they come in the order of steps.
 
-    None for a single tile. A shard has several layers along t only where it has all of each.
+    A member has several layers along t only where it has all of each.
     """
-    if prod(grid) == 1:
-        return None
-    most = max(1, min(SINGLE_SHARD_CHUNKS, SHARD_BYTES // (prod(tile) * itemsize)))
+    most = max(1, min(SINGLE_MEMBER_TILES, TOGETHER_BYTES // (prod(tile) * itemsize)))
     counts = [1] * len(grid)
     for axis in reversed(range(len(grid))):
         counts[axis] = min(grid[axis], most // prod(counts))
         if counts[axis] < grid[axis]:
             break
-    return tuple(n * count for n, count in zip(tile, counts, strict=True))
+    return tuple(counts)
 
 
 ABSENT = ("refuse", "fill")
@@ -427,9 +425,8 @@ class _Job:
             shape=array.shape,
             dtype=array.dtype,
             chunk_shape=array.tile,
-            shard_shape=tiles.shard,
+            together=tiles.metadata.together,
             chunks=tiles.streams(lambda done: self.progress("packing", done, total, note)),
-            dimension_names=("t", "z", "y", "x"),
             codecs=tiles.codecs,
         )
         tiles.check_against_store()

@@ -24,9 +24,10 @@ from fhash_codec.header import figure_attributes, history_line, read_missing, so
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume, holds
 from fhash_formats.container import StoredArray
-from fhash_formats.container.array import Sharding, pack_index
-from fhash_formats.container.header import COMPACT, PLAIN_FEATURE, TABLE
+from fhash_formats.container.array import with_crc32c
+from fhash_formats.container.header import COMPACT, MISSING_ARRAY, PLAIN_FEATURE, TABLE
 from fhash_formats.errors import InputError
+from fhash_formats.readers.stored_parts import ABSENT
 from fhash_formats.series import AXES, NO_AXIS, SourceVariable, with_history
 from fhash_formats.support.files import check_output, replacing
 from fhash_formats.support.threads import chunk_region
@@ -52,9 +53,9 @@ class ChunkTable:
         path: of the container.
         outline: of the array, and of all beside it.
         dtype: of the values.
-        chunk, shard: lengths of a chunk and of a shard of many; None without shards.
+        chunk: lengths of a chunk.
         grid: number of chunks along each dimension.
-        sharding: division into shards; None without.
+        together: chunks of a shard along each dimension.
         codec: that decodes the chunks.
         fill: the number that stands for a missing value; None where there is none, or NaN.
 
@@ -84,13 +85,14 @@ class ChunkTable:
             raise InputError(_refusal(volume, "tiles that are longer than an axis it made up"))
         self.chunk = self.outline.ordered(self._table.chunk_shape)
         self.grid = self.outline.ordered(self._table.grid)
-        shard = self._table.shard_shape
-        self.shard = None if shard is None else self.outline.ordered(shard)
-        self.sharding = (
-            None
-            if self.shard is None
-            else Sharding(shard_shape=self.shard, chunk_shape=self.chunk, codecs=())
-        )
+        self.together = self.outline.ordered(self._table.together or (1, 1, 1, 1))
+
+    @property
+    def shard(self) -> Index | None:
+        """Lengths of a shard; None where chunks are files of their own."""
+        if prod(self.together) == 1:
+            return None
+        return tuple(n * k for n, k in zip(self.chunk, self.together, strict=True))
 
     @property
     def codec(self) -> TransformCodec:
@@ -125,7 +127,7 @@ class ChunkTable:
         volume = self._volume
         fill = volume.value_type.fill
         if self.dtype.kind == "f":
-            return fill if "missing/bits" in volume.container.arrays else None
+            return fill if MISSING_ARRAY in volume.container.arrays else None
         told = volume.value_type.has_gaps
         if volume.metadata is not None:
             told = told or bool({FILL, "missing_value"} & set(volume.metadata.variable_attributes))
@@ -134,7 +136,7 @@ class ChunkTable:
     def _check_missing(self) -> None:
         """Refuse a volume with missing vertices where the tiles have some value."""
         volume = self._volume
-        if "missing/bits" not in volume.container.arrays:
+        if MISSING_ARRAY not in volume.container.arrays:
             return
         for index in product(*map(range, self._table.grid)):
             steps, *space = chunk_region(index, self._table.chunk_shape, volume.shape)
@@ -337,22 +339,34 @@ def _write_chunks(folder: Path, table: ChunkTable, progress: Progress) -> None:
     for outer, indices in _files(table):
         path = place.joinpath("c", *map(str, outer))
         path.parent.mkdir(parents=True, exist_ok=True)
-        sizes = []
         with path.open("wb") as file:
+            streams: dict[Index, int] = {}
             for index in indices:
-                sizes.append(file.write(table.stream(index)))
+                streams[index] = file.write(table.stream(index))
                 done += 1
                 progress("unpacking", done, total, name)
-            if table.sharding is not None:
-                file.write(pack_index(sizes, table.sharding.present(outer, table.outline.shape)))
+            if table.shard is not None:
+                file.write(_shard_index(table, outer, streams))
 
 
-def _files(table: ChunkTable) -> Iterator[tuple[tuple[int, ...], Sequence[tuple[int, ...]]]]:
+def _shard_index(table: ChunkTable, outer: Index, sizes: dict[Index, int]) -> bytes:
+    """The index of a shard of Zarr: offset and bytes of each chunk in it, and their CRC-32C.
+
+    sizes: bytes of the chunks that are there, in the order in which they lie in the shard.
+    """
+    entries = np.full((*table.together, 2), ABSENT, dtype="<u8")
+    offset = 0
+    for index, size in sizes.items():
+        corner = (i * k for i, k in zip(outer, table.together, strict=True))
+        place = tuple(i - first for i, first in zip(index, corner, strict=True))
+        entries[place] = offset, size
+        offset += size
+    return with_crc32c(entries.tobytes())
+
+
+def _files(table: ChunkTable) -> Iterator[tuple[Index, Iterator[Index]]]:
     """Yield the index of each file of an array, and those of the chunks in it, in their order."""
-    if table.sharding is None:
-        yield from ((index, [index]) for index in product(*map(range, table.grid)))
-        return
-    shape = table.outline.shape
-    counts = [-(-n // length) for n, length in zip(shape, table.shard or (), strict=True)]
-    for outer in product(*map(range, counts)):
-        yield outer, list(table.sharding.chunks_of(outer, shape))
+    along = list(zip(table.grid, table.together, strict=True))
+    for outer in product(*(range(-(-n // k)) for n, k in along)):
+        spans = zip(outer, along, strict=True)
+        yield outer, product(*(range(i * k, min((i + 1) * k, n)) for i, (n, k) in spans))

@@ -11,7 +11,7 @@ The tests prove that the zarr library reads every array equal.
     zip_file      bytes at offsets of a file; members of the ZIP, written and checked
     remote        bytes of a file elsewhere, in few requests, by fsspec too
     record        metadata documents as JSON, and checked access to them
-    array         metadata of one array, values of a chunk <-> bytes, many chunks in one member
+    array         metadata of one array, values of a chunk <-> bytes, tiles that lie together
     header        checks of the header, and the positions in it
     source_entry  what belongs to the variable in its source <-> header and arrays
     hierarchy     names of arrays in the hierarchy, headers in its root
@@ -24,7 +24,7 @@ Only `array` and `growing` know of the codec of tiles in `transform`, and `heade
 the shape of its head. No reader of other formats and no writer of regions is imported here.
 """
 
-from fhash_formats.container.array import shard_order, shard_shape
+from fhash_formats.container.array import tiles_together
 from fhash_formats.container.header import describe_coordinates, validate_header
 from fhash_formats.container.reader import Container, Location, Place, StorageOptions, is_container
 from fhash_formats.container.source_entry import SOURCE, describe_metadata, read_metadata
@@ -45,7 +45,6 @@ __all__ = [
     "describe_metadata",
     "is_container",
     "read_metadata",
-    "shard_order",
-    "shard_shape",
+    "tiles_together",
     "validate_header",
 ]

@@ -1,4 +1,4 @@
-"""Arrays: metadata, values of a chunk as bytes, many chunks in one member."""
+"""Arrays: metadata, values of a chunk as bytes, tiles that lie together in a member."""
 
 from __future__ import annotations
 
@@ -94,145 +94,46 @@ def with_crc32c(data: bytes) -> bytes:
     return data + _CRC.pack(crc32c(data))
 
 
-SHARDING = "sharding_indexed"
-"""Name of the codec that makes the chunks of an array shards."""
-MAX_SHARD_CHUNKS = 1 << 20
-"""Inner chunks of a shard that a reader accepts."""
-SINGLE_SHARD_CHUNKS = 4096
-"""Inner chunks up to which `shard_shape` puts a whole array into one shard."""
-ABSENT = 2**64 - 1
-"""Number that stands for both the offset and the bytes of an absent inner chunk."""
-
-INDEX_CODECS: list[Codec] = [{"name": "bytes", "configuration": {"endian": "little"}}, CRC32C]
-"""Codecs of the index; no others are allowed."""
-
-ENTRY_BYTES = 16
-"""Bytes that the index has for each inner chunk."""
+MAX_TOGETHER = 1 << 20
+"""Tiles of a member that a reader accepts."""
+SINGLE_MEMBER_TILES = 4096
+"""Tiles up to which `tiles_together` puts a whole array into one member."""
+TILES = "tiles"
+"""Attribute of the index of tiles: what they are."""
+PACKAGE = "fhash"
+"""Package that decodes tiles, which the attribute names for readers of other libraries."""
 
 Index = tuple[int, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sharding:
-    """Division of an array into shards, and of a shard into inner chunks.
+def tiles_together(grid: Sequence[int], sizes: npt.NDArray[np.int64] | None = None) -> Index:
+    """How many tiles along each axis a writer lays into one member, of an array of such a `grid`.
 
-    Attributes:
-        shard_shape: vertices of a shard along each axis, a multiple of `chunk_shape`.
-        chunk_shape: vertices of an inner chunk along each axis.
-        codecs: codecs of the inner chunks.
+    One member holds the whole array up to SINGLE_MEMBER_TILES. A larger array gets a member for
+    each layer of tiles along the first axis. Members beyond the limits of the format are halved,
+    along the first axis first, so that C order stays the order of the file.
+
+    sizes: coded bytes of each tile in C order; None for an array that is not that large.
     """
-
-    shard_shape: tuple[int, ...]
-    chunk_shape: tuple[int, ...]
-    codecs: Sequence[Codec]
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """Inner chunks of a shard along each axis."""
-        return tuple(
-            n // chunk for n, chunk in zip(self.shard_shape, self.chunk_shape, strict=True)
-        )
-
-    def chunks_of(self, shard: Index, shape: Sequence[int]) -> Iterator[Index]:
-        """The inner chunks present in a shard of an array of `shape`, in C order.
-
-        Indices are those of the array's grid of inner chunks.
-        """
-        spans = []
-        for s, count, chunk, n in zip(shard, self.counts, self.chunk_shape, shape, strict=True):
-            spans.append(range(s * count, min((s + 1) * count, -(-n // chunk))))
-        return product(*spans)
-
-    def present(self, shard: Index, shape: Sequence[int]) -> npt.NDArray[np.bool_]:
-        """A mask (chunks of the shard,) of those that are present: they hold a vertex of the array.
-
-        `shape` is that of the array; the numbers of the inner chunks are those of `locate`.
-        """
-        present = np.ones(1, dtype=bool)
-        for s, count, chunk, n in zip(shard, self.counts, self.chunk_shape, shape, strict=True):
-            present_along_axis = np.arange(count) < -(-n // chunk) - s * count
-            present = (present[:, None] & present_along_axis).ravel()
-        return present
-
-
-def shard_order(
-    shape: Sequence[int], chunk_shape: Sequence[int], shard_shape: Sequence[int]
-) -> Iterator[Index]:
-    """Yield the index of every inner chunk of an array in the order of the file.
-
-    Shards come in C order, and within each shard its inner chunks in C order.
-    """
-    sharding = Sharding(shard_shape=tuple(shard_shape), chunk_shape=tuple(chunk_shape), codecs=())
-    for shard in product(
-        *(range(-(-n // size)) for n, size in zip(shape, shard_shape, strict=True))
-    ):
-        yield from sharding.chunks_of(shard, shape)
-
-
-def shard_shape(
-    chunk_shape: Sequence[int], grid: Sequence[int], sizes: npt.NDArray[np.int64] | None = None
-) -> Index:
-    """The shape of the shards that a writer chooses for an array of `grid` inner chunks.
-
-    One shard holds the whole array up to SINGLE_SHARD_CHUNKS inner chunks. A larger array gets a
-    shard for each layer of inner chunks along the first axis. Shards beyond the limits of the
-    format are halved, along the first axis first, so that C order stays the order of the file.
-
-    sizes: coded bytes of each inner chunk in C order; None for an array that is not that large.
-    """
-    counts = [grid[0] if prod(grid) <= SINGLE_SHARD_CHUNKS else 1, *grid[1:]]
+    counts = [grid[0] if prod(grid) <= SINGLE_MEMBER_TILES else 1, *grid[1:]]
     for axis in range(len(counts)):
         while counts[axis] > 1 and _beyond_limits(counts, grid, sizes):
             counts[axis] = -(-counts[axis] // 2)
-    return tuple(n * count for n, count in zip(chunk_shape, counts, strict=True))
+    return tuple(counts)
 
 
 def _beyond_limits(
     counts: Sequence[int], grid: Sequence[int], sizes: npt.NDArray[np.int64] | None
 ) -> bool:
-    """Whether shards of so many inner chunks along each axis have too many, or too many bytes."""
-    if prod(counts) > MAX_SHARD_CHUNKS:
+    """Whether members of so many tiles along each axis have too many, or too many bytes."""
+    if prod(counts) > MAX_TOGETHER:
         return True
     if sizes is None:
         return False
-    total = np.reshape(sizes + _CRC.size, grid)
+    total = np.reshape(sizes, grid)
     for axis, count in enumerate(counts):
         total = np.add.reduceat(total, range(0, grid[axis], count), axis=axis)
-    return int(total.max()) + prod(counts) * ENTRY_BYTES + _CRC.size > MAX_MEMBER
-
-
-def sharding_codecs(chunk_shape: Sequence[int], codecs: Sequence[Codec]) -> list[Codec]:
-    """The codecs of an array of shards whose inner chunks of `chunk_shape` have `codecs`."""
-    configuration = {
-        "chunk_shape": list(chunk_shape),
-        "codecs": list(codecs),
-        "index_codecs": INDEX_CODECS,
-        "index_location": "end",
-    }
-    return [{"name": SHARDING, "configuration": configuration}]
-
-
-def sharding_of(codecs: Sequence[Codec], shard_shape: tuple[int, ...]) -> Sharding | None:
-    """The sharding that an array's codecs ask for; None where they ask for none."""
-    if codecs[0]["name"] != SHARDING:
-        return None
-    settings = codecs[0]["configuration"]
-    inner = tuple(settings["chunk_shape"])
-    return Sharding(shard_shape=shard_shape, chunk_shape=inner, codecs=settings["codecs"])
-
-
-def pack_index(sizes: Sequence[int], present: npt.NDArray[np.bool_]) -> bytes:
-    """The index of a shard with its CRC-32C.
-
-    Args:
-        sizes: bytes of each inner chunk that is present, in C order.
-        present: mask of the inner chunks of the shard (`Sharding.present`).
-    """
-    table = np.full((present.size, 2), ABSENT, dtype="<u8")
-    ends = np.cumsum(np.array(sizes, dtype=np.uint64), dtype=np.uint64)
-    table[present, 0] = np.concatenate([np.zeros(1, np.uint64), ends[:-1]])
-    table[present, 1] = sizes
-    return with_crc32c(table.tobytes())
+    return int(total.max()) > MAX_MEMBER
 
 
 MAX_DIMENSIONS = 8
@@ -243,31 +144,27 @@ MAX_DIMENSIONS = 8
 class ArrayMetadata:
     """Shape, number type, chunking and codecs of an array.
 
-    A member of the file holds one chunk of `chunk_shape`. Where the codecs ask for shards
-    (`sharding`), that chunk is a shard of many inner chunks, each decoded alone. Elsewhere the
-    chunk is its own and only inner chunk.
+    The chunks of an array of tiles are coded by `fhash.transform`. A member of the file holds one
+    chunk, or several tiles in C order; an index then has the bytes of each.
 
-    Every length is at least 1. The last inner chunks along an axis are stored in full, padded
-    with 0.
+    Every length is at least 1. The last chunks along an axis are stored in full, padded with 0.
+
+    Attributes:
+        together: tiles of a member along each axis; None for an array that has none.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     chunk_shape: tuple[int, ...]
     codecs: Sequence[Mapping[str, Any]]
+    together: tuple[int, ...] | None = None
     dimension_names: tuple[str | None, ...] | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
-    def sharding(self) -> Sharding | None:
-        """Division of a member into inner chunks; None where the member is one chunk."""
-        return sharding_of(self.codecs, self.chunk_shape)
-
-    @cached_property
     def coder(self) -> PlainCoder | TransformCoder:
-        """The coder of full inner chunks."""
-        codecs = self.codecs if self.sharding is None else self.sharding.codecs
-        return chunk_coder(codecs, self.dtype, self.inner_shape)
+        """The coder of full chunks."""
+        return chunk_coder(self.codecs, self.dtype, self.chunk_shape)
 
     @property
     def tiles(self) -> TransformCoder | None:
@@ -276,69 +173,113 @@ class ArrayMetadata:
 
     @property
     def coding(self) -> str:
-        """Name of the first codec of inner chunks."""
-        codecs = self.codecs if self.sharding is None else self.sharding.codecs
-        return str(codecs[0]["name"])
-
-    @property
-    def inner_shape(self) -> tuple[int, ...]:
-        """Shape of an inner chunk, the least that is decoded."""
-        return self.chunk_shape if self.sharding is None else self.sharding.chunk_shape
+        """Name of the first codec."""
+        return str(self.codecs[0]["name"])
 
     @property
     def chunk_bytes(self) -> int:
-        """Bytes of a decoded inner chunk."""
-        return prod(self.inner_shape) * self.dtype.itemsize
+        """Bytes of a decoded chunk."""
+        return prod(self.chunk_shape) * self.dtype.itemsize
 
     @property
     def grid(self) -> tuple[int, ...]:
-        """Number of members along each axis."""
+        """Number of chunks along each axis."""
         return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.chunk_shape, strict=True))
 
     @property
-    def inner_grid(self) -> tuple[int, ...]:
-        """Number of inner chunks along each axis."""
-        return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.inner_shape, strict=True))
+    def members(self) -> tuple[int, ...]:
+        """Number of members along each axis."""
+        together = self.together or (1,) * len(self.shape)
+        return tuple(-(-n // count) for n, count in zip(self.grid, together, strict=True))
 
-    def chunk_key(self, index: Sequence[int]) -> str:
-        """Name of the member of a chunk, below that of its array: "c/0/0"."""
-        return "c/" + "/".join(str(i) for i in index)
+    @property
+    def indexed(self) -> bool:
+        """Whether members hold several tiles, whose bytes the index has."""
+        return self.together is not None and prod(self.together) > 1
 
-    def inner_region(self, index: Sequence[int]) -> tuple[slice, ...]:
-        """The region of the array that an inner chunk holds, cut at the array's end."""
-        return chunk_region(index, self.inner_shape, self.shape)
+    def chunks_of(self, member: Index) -> Iterator[Index]:
+        """The chunks of a member, in the order in which they lie in it."""
+        together = self.together or (1,) * len(self.shape)
+        return product(
+            *(
+                range(i * count, min((i + 1) * count, n))
+                for i, count, n in zip(member, together, self.grid, strict=True)
+            )
+        )
+
+    def member_name(self, member: Index) -> str:
+        """Name of a member below that of its array: "c/0/0" of a chunk, "t/0" of tiles."""
+        if self.together is None:
+            return "c/" + "/".join(str(i) for i in member)
+        return f"t/{int(np.ravel_multi_index(member, self.members))}"
+
+    def index_chunk(self, member: Index, sizes: Sequence[int]) -> bytes:
+        """The chunk of the index of a member whose tiles have so many bytes."""
+        assert self.together is not None
+        chunk = np.zeros(self.together, dtype=np.uint32)
+        there = (n - i * k for i, k, n in zip(member, self.together, self.grid, strict=True))
+        part = chunk[tuple(slice(0, n) for n in there)]
+        part[...] = np.reshape(sizes, part.shape)
+        return PlainCoder(plain_codecs(chunk.dtype), chunk.dtype, self.together).encode(chunk)
+
+    def region(self, index: Sequence[int]) -> tuple[slice, ...]:
+        """The region of the array that a chunk holds, cut at the array's end."""
+        return chunk_region(index, self.chunk_shape, self.shape)
 
     def to_dict(self) -> dict[str, Any]:
-        """The array's zarr.json as JSON values."""
+        """The array's zarr.json as JSON values; that of the index of an array of tiles."""
+        shape, dtype, chunk = self.shape, self.dtype, self.chunk_shape
+        codecs, attributes = self.codecs, dict(self.attributes)
+        if self.together is not None:
+            attributes[TILES] = {
+                "codec": self.coding,
+                "package": PACKAGE,
+                "shape": list(shape),
+                "data_type": dtype.name,
+                "tile": list(chunk),
+                **codecs[0]["configuration"],
+            }
+            shape, dtype, chunk = self.grid, np.dtype(np.uint32), self.together
+            codecs = plain_codecs(dtype)
         values: dict[str, Any] = {
             "zarr_format": 3,
             "node_type": "array",
-            "shape": list(self.shape),
-            "data_type": self.dtype.name,
-            "chunk_grid": {
-                "name": "regular",
-                "configuration": {"chunk_shape": list(self.chunk_shape)},
-            },
+            "shape": list(shape),
+            "data_type": dtype.name,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk)}},
             # The separator of the default encoding is "/" where none is named.
             "chunk_key_encoding": {"name": "default"},
-            "fill_value": 0.0 if self.dtype.kind == "f" else 0,
-            "codecs": list(self.codecs),
+            "fill_value": 0.0 if dtype.kind == "f" else 0,
+            "codecs": list(codecs),
         }
-        if self.dimension_names is not None:
+        if self.dimension_names is not None and self.together is None:
             values["dimension_names"] = list(self.dimension_names)
-        if self.attributes:
-            values["attributes"] = dict(self.attributes)
+        if attributes:
+            values["attributes"] = attributes
         return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ArrayMetadata:
         """The metadata in a zarr.json that libfhash has checked."""
+        attributes = dict(values.get("attributes", {}))
+        tiles = attributes.pop(TILES, None)
+        chunk = tuple(values["chunk_grid"]["configuration"]["chunk_shape"])
+        if tiles is not None:
+            told = {key: tiles[key] for key in ("settings", "axes") if key in tiles}
+            return cls(
+                shape=tuple(tiles["shape"]),
+                dtype=DTYPES[tiles["data_type"]],
+                chunk_shape=tuple(tiles["tile"]),
+                codecs=[{"name": TRANSFORM, "configuration": told}],
+                together=chunk,
+                attributes=attributes,
+            )
         names = values.get("dimension_names")
         return cls(
             shape=tuple(values["shape"]),
             dtype=DTYPES[values["data_type"]],
-            chunk_shape=tuple(values["chunk_grid"]["configuration"]["chunk_shape"]),
+            chunk_shape=chunk,
             codecs=values["codecs"],
             dimension_names=None if names is None else tuple(names),
-            attributes=values.get("attributes", {}),
+            attributes=attributes,
         )

@@ -18,9 +18,7 @@ import numpy.typing as npt
 from fhash_formats.container.array import (
     ArrayMetadata,
     Codec,
-    pack_index,
-    shard_shape,
-    sharding_codecs,
+    tiles_together,
     transform_codecs,
 )
 from fhash_formats.container.header import TABLE
@@ -45,9 +43,6 @@ from fhash_formats.transform.tile_format import TileSettings
 class TableParts:
     """The tiles of a table, coded.
 
-    Head and masks stay in the codec and in the tiles, so that a library of Zarr that has the codec
-    decodes the table by what the array itself says.
-
     Attributes:
         shape: lengths of the axes (t, z, y, x).
         dtype: type of the values.
@@ -70,25 +65,18 @@ class TableParts:
         name: str = TABLE,
         attributes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Write the table, an array of a chunk for each tile.
-
-        A single tile needs no shard, whose index and description would take some 120 bytes.
-        """
-        shards = None
-        if len(self.streams) > 1:
-            grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
-            sizes = self.sizes
-            if sizes is None:
-                sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
-            shards = shard_shape(self.tile, grid, sizes)
+        """Write the table."""
+        grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
+        sizes = self.sizes
+        if sizes is None:
+            sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
         writer.add_array(
             name,
             shape=self.shape,
             dtype=self.dtype,
             chunk_shape=self.tile,
-            shard_shape=shards,
+            together=tiles_together(grid, sizes),
             chunks=iter(self.streams),
-            dimension_names=("t", "z", "y", "x"),
             attributes=attributes,
             codecs=transform_codecs(self.settings),
         )
@@ -108,7 +96,6 @@ class GrowingArray:
         dtype: number type of the array.
         tile: shape (t, z, y, x) of a tile.
         codecs: of the tiles.
-        dimension_names: names of the axes.
     """
 
     name: str
@@ -116,23 +103,11 @@ class GrowingArray:
     dtype: np.dtype[Any]
     tile: tuple[int, ...]
     codecs: Sequence[Codec]
-    dimension_names: Sequence[str | None] = ("t", "z", "y", "x")
 
     @property
     def layer_grid(self) -> tuple[int, ...]:
         """Tiles of a layer along (z, y, x)."""
         return tuple(-(-n // length) for n, length in zip(self.frame, self.tile[1:], strict=True))
-
-    @property
-    def chunk_shape(self) -> tuple[int, ...]:
-        """Shape of a member's chunk: a shard of a whole layer, or the only tile of a layer."""
-        parts = zip(self.layer_grid, self.tile[1:], strict=True)
-        return (self.tile[0], *(count * length for count, length in parts))
-
-    @property
-    def is_sharded(self) -> bool:
-        """Whether a layer has several tiles, and so needs a shard."""
-        return prod(self.layer_grid) > 1
 
 
 class GrowingContainer(ContainerWriter):
@@ -193,30 +168,29 @@ class GrowingContainer(ContainerWriter):
         order. Raises InputError for a layer that takes too many bytes.
         """
         assert len(streams) == prod(array.layer_grid)
-        parts = list(streams)
-        if array.is_sharded:
-            present = np.ones(len(parts), dtype=bool)
-            parts.append(pack_index([len(part) for part in parts], present))
-        self._add(array.name, f"c/{number}/0/0/0", parts)
+        metadata = self._layers(array, (number + 1) * array.tile[0])
+        self._add_member(array.name, metadata, (number, 0, 0, 0), streams)
 
-    def describe(self, array: GrowingArray, steps: int) -> ArrayMetadata:
-        """Write the metadata of an array of so many steps, whose layers were added before."""
-        codecs = sharding_codecs(array.tile, array.codecs) if array.is_sharded else array.codecs
-        return self._begin(
+    def describe(self, array: GrowingArray, steps: int) -> None:
+        """Take the metadata of an array of so many steps, whose layers were added before."""
+        self._describe(array.name, self._layers(array, steps))
+
+    def _layers(self, array: GrowingArray, steps: int) -> ArrayMetadata:
+        """The metadata of an array of so many steps, a layer of tiles in each member."""
+        return self._metadata(
             array.name,
             (steps, *array.frame),
             array.dtype,
-            array.chunk_shape,
-            codecs,
-            array.dimension_names,
-            None,
+            array.tile,
+            codecs=array.codecs,
+            together=(1, *array.layer_grid),
         )
 
     def publish(self, header: Mapping[str, Any], mark: Mark) -> int:
-        """Write the groups, the header and the directory, and let the file take its name.
+        """Write the documents and the directory, and let the file take its name.
 
-        mark: the members behind it are of this state alone, as metadata are; the next state has
-        others in their place.
+        mark: the arrays behind it are of this state alone; the next state has others in their
+        place.
 
         Returns the number of bytes of the file. Raises InputError for a header that does not fit
         the arrays, and OutputError for a full disk or if another process took the name; the state

@@ -11,23 +11,24 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.record import MAX_LENGTH, Record
-from fhash_formats.errors import UnsupportedFileError
+from fhash_formats.errors import InputError, UnsupportedFileError
 from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.values import DTYPES, Double
 from fhash_formats.transform.head import MAX_HIDDEN
 from fhash_formats.transform.head import MAX_WIDTH as MAX_HEAD_WIDTH
 
-MAX_LISTED = 1024
-"""Positions that are written as a list, also one of `ulps`; a reader takes any number.
-
-An array of their own takes 400 to 500 bytes more than the list, until digits outweigh that.
-"""
+MAX_LISTED = 1 << 20
+"""Numbers of a list of positions, or of differences from a rule."""
+MAX_NEARLY = 1024
+"""Positions up to which rules are tried from which all of them differ a little."""
 MAX_ULPS = 99
 """Units in the last place by which a position but the last may differ from a written rule."""
 ULPS_LIMIT = 2**52 - 1
 """Largest such difference that a reader takes."""
-MAX_RULED = 1 << 20
-"""Positions that a header describes; the limit keeps a few bytes from asking for much memory."""
+MAX_RULED = 1 << 26
+"""Positions of a rule; the limit keeps a few bytes from asking for much memory."""
+NOT_FINITE = ("NaN", "Infinity", "-Infinity")
+"""Texts of positions that are no numbers in JSON."""
 TYPES = ("float64", "float32")
 """Number types that positions are rounded to; the first is the default."""
 
@@ -35,62 +36,76 @@ _DIGITS = (*range(1, 16), 17)
 """Numbers of significant decimal digits that guesses of a step are rounded to."""
 
 
-def describe_coordinates(
-    coords: Mapping[str, Coordinate], dimensions: Sequence[str] = tuple(AXIS_NAMES.values())
-) -> dict[str, Any]:
-    """The header's `coordinates`, without those that need an array of their own.
+def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
+    """The header's `coordinates`.
 
-    Args:
-        coords: a coordinate for each of "t", "z", "y" and "x".
-        dimensions: names of these axes in the header, which those of coordinates are by default.
+    coords: a coordinate for each of "t", "z", "y" and "x". Raises InputError for irregular
+    positions beyond MAX_LISTED.
     """
     described = {}
-    for (axis, stored), dimension in zip(AXIS_NAMES.items(), dimensions, strict=True):
+    for axis, stored in AXIS_NAMES.items():
         coordinate = coords[axis]
         description = describe_positions(coordinate.values)
-        if description is not None:
-            name = {} if coordinate.name == dimension else {"name": coordinate.name}
-            attributes = (
-                {"attributes": dict(coordinate.attributes)} if coordinate.attributes else {}
+        if description is None:
+            raise InputError(
+                f"axis {axis} has {coordinate.values.size:,} irregular positions; a file has"
+                f" {MAX_LISTED:,} at most: encode parts of it, or give it regular positions"
             )
-            described[stored] = {**description, **name, **attributes}
+        if coordinate.name != stored:
+            description["name"] = coordinate.name
+        if coordinate.attributes:
+            description["attributes"] = dict(coordinate.attributes)
+        if description:
+            described[stored] = description
     return described
 
 
-def described_coordinate(description: Mapping[str, Any], dimension: str, length: int) -> Coordinate:
+def described_coordinate(description: Mapping[str, Any], stored: str, length: int) -> Coordinate:
     """The coordinate that a description stands for, once `check_positions` has passed it.
 
     Args:
         description: the axis' object in the header.
-        dimension: name of the axis in the header.
+        stored: name of the axis: "time", "z", "y" or "x".
         length: number of positions.
     """
-    values = positions(description, length)
     return Coordinate(
-        name=description.get("name", dimension),
-        values=values,
+        name=description.get("name", stored),
+        values=positions(description, length),
         attributes=description.get("attributes", {}),
     )
 
 
-def describe_positions(values: Double) -> dict[str, Any] | None:
-    """The header's description of positions, float64 (n,); None where only an array will do.
+def shared_coordinates(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Headers in which axes have the objects of the variables whose numbers stood there."""
+    found = []
+    for entry in entries:
+        coordinates = {
+            axis: entries[told]["coordinates"][axis] if isinstance(told, int) else told
+            for axis, told in entry.get("coordinates", {}).items()
+        }
+        found.append({**entry, "coordinates": coordinates})
+    return found
 
-    `positions` turns the description into the same positions, bit by bit.
+
+def describe_positions(values: Double) -> dict[str, Any] | None:
+    """The header's description of positions, float64 (n,); None where there is none.
+
+    `positions` turns the description into the same positions, bit by bit; all NaN are one.
     """
-    if not np.isfinite(values).all() or values.size > MAX_RULED:
-        return None
+    if not np.isfinite(values).all():
+        texts = [value if np.isfinite(value) else _text(value) for value in values.tolist()]
+        return {"values": texts} if values.size <= MAX_LISTED else None
     with np.errstate(over="ignore"):
         narrow = np.array_equal(values, values.astype(np.float32))
     kinds = TYPES if narrow else TYPES[:1]
-    for kind, most in product(kinds, (0, 1)):
+    for kind, most in product(kinds if values.size <= MAX_RULED else (), (0, 1)):
         for start, step in _candidates(values, kind):
             rule = _moved_rule(values, start, step, kind)
             if rule is not None and len(rule.get("ulps", ())) <= most:
                 return rule
     if values.size > MAX_LISTED:
         return None
-    nearly = _nearly_ruled(values, kinds)
+    nearly = _nearly_ruled(values, kinds) if values.size <= MAX_NEARLY else None
     if nearly is not None:
         return nearly
     short = (
@@ -105,6 +120,11 @@ def describe_positions(values: Double) -> dict[str, Any] | None:
     )
 
 
+def _text(value: float) -> str:
+    """The text of a number that is not finite."""
+    return NOT_FINITE[0] if np.isnan(value) else NOT_FINITE[1 if value > 0 else 2]
+
+
 def positions(description: Mapping[str, Any], length: int) -> Double:
     """The positions that a description stands for, float64 (length,).
 
@@ -113,7 +133,7 @@ def positions(description: Mapping[str, Any], length: int) -> Double:
     # A position beyond its type becomes an infinity; arrays of positions may hold infinities too.
     with np.errstate(over="ignore", invalid="ignore"):
         if "values" in description:
-            values = np.array(description["values"], dtype=np.float64)
+            values = np.array([float(value) for value in description["values"]], dtype=np.float64)
         else:
             values = np.arange(length, dtype=np.float64) * float(description.get("step", 1))
             values += float(description.get("start", 0))
@@ -132,11 +152,19 @@ def check_positions(record: Record, length: int) -> None:
     if record.has("dtype"):
         record.choice("dtype", TYPES)
     if record.has("values"):
-        record.numbers("values", length)
+        values = record.get("values")
+        listed = isinstance(values, list) and len(values) == length <= MAX_LISTED
+        record.need(listed, "values", f"a list of {length} positions, at most {MAX_LISTED}")
+        finite = [value for value in values if value not in NOT_FINITE]
+        good = all(type(value) in (int, float) for value in finite)
+        record.need(good, "values", f"numbers, {', '.join(NOT_FINITE)}")
+    else:
+        record.need(length <= MAX_RULED, "step", f"of at most {MAX_RULED} positions")
     if record.has("ulps"):
         ulps = record.get("ulps")
         count = len(ulps) if isinstance(ulps, list) else 0
-        record.need(1 <= count <= length, "ulps", f"1 to {length} whole numbers")
+        most = min(length, MAX_LISTED)
+        record.need(1 <= count <= most, "ulps", f"1 to {most} whole numbers")
         record.integers("ulps", count, -ULPS_LIMIT, ULPS_LIMIT)
         record.need(not record.has("values"), "ulps", "a rule, and no values")
     if record.has("name"):
@@ -276,15 +304,11 @@ COMPACT = "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 TABLE = "tables/level_1"
 """Name of the array of the finest table."""
-BITS_ARRAY = "occupancy/bits"
+BITS_ARRAY = "occupancy"
 """Name of the array of the occupancy as bits."""
-MASK_ARRAY = "occupancy/mask"
-"""Name of the array of an occupancy that is coded, in place of bits."""
-MASK_FEATURES = 8
-"""Largest number of features whose occupancy the numbers of a mask tell."""
-MISSING_ARRAY = "missing/bits"
+MISSING_ARRAY = "missing"
 """Name of the array of the bits of vertices without a value."""
-STEPS = "steps/figures"
+STEPS = "step_figures"
 """Name of the array of the figures of single steps, where they are not in the header."""
 STEP_FIGURES = ("rmse", "max_abs_error")
 """Lists of `quality.steps`, and rows of this array."""
@@ -510,15 +534,11 @@ def _box(top: Record, shape: Sequence[int]) -> list[int]:
 
 
 def _check_coordinates(top: Record, shape: Sequence[int]) -> None:
-    """Check the positions that stand in the header; those of other axes are in arrays."""
-    if top.has("coordinates"):
-        coordinates = top.record("coordinates")
-        for axis, length in zip(POSITIONS, shape, strict=True):
-            if coordinates.has(axis):
-                coordinates.need(
-                    length <= MAX_RULED, axis, f"an array for more than {MAX_RULED} positions"
-                )
-                check_positions(coordinates.record(axis), length)
+    """Check the positions along the axes."""
+    coordinates = top.record("coordinates")
+    for axis, length in zip(POSITIONS, shape, strict=True):
+        if coordinates.has(axis):
+            check_positions(coordinates.record(axis), length)
 
 
 def _largest_decoded(source: np.dtype[Any]) -> float:

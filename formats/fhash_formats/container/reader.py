@@ -27,14 +27,7 @@ from fhash_formats.container.header import (
     TOGETHER,
     described_coordinate,
 )
-from fhash_formats.container.hierarchy import (
-    ARRAY,
-    DIMENSIONS,
-    PARTS,
-    SHARES,
-    read_headers,
-    variable_named,
-)
+from fhash_formats.container.hierarchy import SHARES, group_of, read_headers, variable_named
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.source_entry import AUXILIARY, check_source
 from fhash_formats.container.stored import NativeFile, StoredArray
@@ -55,13 +48,9 @@ from fhash_formats.transform.head import INPUTS
 def check_beside(header: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> None:
     """Check what libfhash does not look at when it opens a file.
 
-    These are names of coordinates, the key frames, and the figures of single steps. Raises
-    DamagedFileError where they do not fit the header.
+    These are the key frames, and the figures of single steps. Raises DamagedFileError where they
+    do not fit the header.
     """
-    for axis in POSITIONS:
-        name = f"coords/{axis}"
-        if name in arrays and "name" in arrays[name].attributes:
-            Record(arrays[name].attributes, f"array {name} attribute ").text("name")
     if KEY_FRAMES in arrays:
         steps, keys = header["domain"]["shape"][0], arrays[KEY_FRAMES].read()
         if keys[0] < 0 or keys[-1] >= steps or np.any(keys[1:] <= keys[:-1]):
@@ -177,7 +166,6 @@ CACHE_BYTES = 256 << 20
 """Bytes of decoded chunks that an open container keeps."""
 SPLIT = {
     "field": ("tables", "corrections", "occupancy", "missing"),
-    "coordinates": ("coords",),
     "beside": ("auxiliary",),
     "model": ("mlp",),
 }
@@ -188,7 +176,6 @@ class Split(TypedDict):
     """Bytes of a file by what they hold; they add up to its size."""
 
     field: Annotated[int, "tables, corrections, and which vertices have values"]
-    coordinates: Annotated[int, "arrays of positions along an axis"]
     beside: Annotated[int, "arrays that the source has beside the values"]
     model: Annotated[int, "layers, and documents of coded tables: head, bases and steps"]
     index: Annotated[int, "header, directory, names, and all else"]
@@ -236,8 +223,7 @@ class Container:
             "fhash" of the root.
         attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
-        arrays: StoredArray by name, in the order of the file; "/" and the path for those that the
-            format does not know. Of several variables, by path.
+        arrays: StoredArray by path, in the order of the file.
         variables: of a file of several, by name in the order of its list; each is a container as
             if it were alone in the file. None in a file of one variable.
         variable: name of the variable where the container is one of those; else None.
@@ -288,24 +274,20 @@ class Container:
             for node in nodes
             if node.number
         }
+        order = {number: place for place, number in enumerate(stored)}
         variables = []
         for number, (name, header) in enumerate(headers.items()):
-            order = {each: place for place, each in enumerate(stored)}
             places = sorted(file.places(number).items(), key=lambda place: order[place[1]])
             arrays = {name: stored[each] for name, each in places}
             with variable_named(name, len(headers)):
                 check_beside(header, arrays)
                 check_source(header, arrays)
             variables.append((name, header, arrays))
+        self.arrays = MappingProxyType({array.name: array for array in stored.values()})
         if len(variables) == 1:
-            self._name, self.header, own = variables[0]
-            names = {array.number: name for name, array in own.items()}
-            self.arrays = MappingProxyType(
-                {names.get(n, f"/{array.name}"): array for n, array in stored.items()}
-            )
+            self._name, self.header, _ = variables[0]
             return
         self.header = json.loads(root.text)["attributes"]["fhash"]
-        self.arrays = MappingProxyType({array.name: array for array in stored.values()})
         self.variables = MappingProxyType(
             {
                 name: VariableContainer(self, number, header, arrays)
@@ -367,21 +349,10 @@ class Container:
         return self._source.bytes_read
 
     def coordinate(self, stored: str) -> Coordinate:
-        """Positions along the axis `stored`: "time", "z", "y" or "x".
-
-        They come from their array or, where there is none, from the header.
-        """
+        """The coordinate of the axis `stored`: "time", "z", "y" or "x"."""
         axis = POSITIONS.index(stored)
-        if f"coords/{stored}" not in self.arrays:
-            return described_coordinate(
-                self.header["coordinates"][stored],
-                self.header[DIMENSIONS][axis],
-                self.header["domain"]["shape"][axis],
-            )
-        array = self.arrays[f"coords/{stored}"]
-        attributes = dict(array.attributes)
-        name = attributes.pop("name", array.name)
-        return Coordinate(name=name, values=array.read(), attributes=attributes)
+        described = self.header["coordinates"].get(stored, {})
+        return described_coordinate(described, stored, self.header["domain"]["shape"][axis])
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
         """Read and decode every chunk; the number of arrays. Metadata were read at opening.
@@ -467,8 +438,7 @@ class VariableContainer(Container):
     Attributes:
         size: bytes of the arrays of this variable alone, with their places in the ZIP.
         digest: of the file and the variable.
-        arrays: StoredArray by the name that it has in a file of one variable. The shared
-            coordinates are among them.
+        arrays: StoredArray by the name that it has in a file of one variable.
     """
 
     def __init__(
@@ -495,11 +465,9 @@ class VariableContainer(Container):
         self._container, self._source, self._file = file, file._source, file._file
         self._closes_file = False
         shared = [name for name in header.get(SHARES, ()) if not name.startswith(AUXILIARY)]
-        begin, table = f"{PARTS}/{number}.", header.get(ARRAY)
+        begin = group_of(number)
         self._own = [
-            name
-            for name, array in arrays.items()
-            if name in shared or array.name.startswith(begin) or array.name == table
+            name for name, array in arrays.items() if name in shared or array.name.startswith(begin)
         ]
         self.size = sum(arrays[name].place_bytes for name in self._own)
         self._documents = [arrays[name].place_of_document for name in self._own]

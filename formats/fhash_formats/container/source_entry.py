@@ -154,7 +154,7 @@ def _parsed(
 ) -> tuple[dict[str, str], list[_Entry]]:
     """The dimensions of the variable, and the arrays beside it, all checked."""
     top = Record(header, "header key ").record(SOURCE)
-    names = _coordinate_names(header, arrays)
+    names = _coordinate_names(header)
     dimensions = _dimensions(top, names)
     by_axis = dict(zip(AXES, header["domain"]["shape"], strict=True))
     for axis, length in by_axis.items():
@@ -188,19 +188,13 @@ def _parsed(
     return dimensions, entries
 
 
-def _coordinate_names(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> dict[str, str]:
+def _coordinate_names(header: Mapping[str, Any]) -> dict[str, str]:
     """Name of each axis in the source."""
     described = header.get("coordinates", {})
-    # A file of several variables has them under their own names, which its header lists.
-    usual = header.get("dimensions")
-    if not isinstance(usual, list) or len(usual) != len(AXIS_NAMES):
-        usual = list(AXIS_NAMES.values())
-    found = {}
-    for (axis, stored), name in zip(AXIS_NAMES.items(), usual, strict=True):
-        array = arrays.get(f"coords/{stored}")
-        place = described.get(stored, {}) if array is None else array.attributes
-        found[axis] = str(place.get("name", name))
-    return found
+    return {
+        axis: str(described.get(stored, {}).get("name", stored))
+        for axis, stored in AXIS_NAMES.items()
+    }
 
 
 def _dimensions(top: Record, names: Mapping[str, str]) -> dict[str, str]:
@@ -263,7 +257,7 @@ def _entry(
     if axis is not None:
         length = header["domain"]["shape"][AXES.index(axis)]
         record.need(kind in DTYPES and prod(shape) == length, "axis", f"numbers, {length} of them")
-        base = _base_attributes(header, arrays, axis) if name == names[axis] else {}
+        base = _base_attributes(header, axis) if name == names[axis] else {}
     elif record.has("array"):
         array = record.text("array")
         _check_array(array, arrays, shape or (1,), dtype)
@@ -303,15 +297,10 @@ def _check_array(
         )
 
 
-def _base_attributes(
-    header: Mapping[str, Any], arrays: Mapping[str, Readable], axis: str
-) -> Mapping[str, Any]:
+def _base_attributes(header: Mapping[str, Any], axis: str) -> Mapping[str, Any]:
     """Attributes of the coordinate of an axis."""
-    stored = AXIS_NAMES[axis]
-    array = arrays.get(f"coords/{stored}")
-    if array is not None:
-        return {key: value for key, value in array.attributes.items() if key != "name"}
-    found: Mapping[str, Any] = header["coordinates"][stored].get("attributes", {})
+    described = header.get("coordinates", {}).get(AXIS_NAMES[axis], {})
+    found: Mapping[str, Any] = described.get("attributes", {})
     return found
 
 

@@ -299,9 +299,9 @@ class StoredArray:
         place_of_document: of its metadata among those of the file, from 0.
         shape: length of each axis.
         dtype: number type.
-        chunk_shape: shape of a full chunk; of an inner chunk where there are shards.
+        chunk_shape: shape of a full chunk.
         grid: chunks along each axis.
-        shard_shape: shape of a shard; None where there are none.
+        together: tiles of a member of the file along each axis; None for other chunks.
         dimension_names: names of the axes, or None.
         attributes: JSON values.
         nbytes_stored: bytes of the chunks in the file.
@@ -325,9 +325,8 @@ class StoredArray:
         self.document_bytes = node.document_bytes
         self.shape = metadata.shape
         self.dtype = metadata.dtype
-        self.chunk_shape = metadata.inner_shape
-        self.grid = metadata.inner_grid
-        self.shard_shape = None if metadata.sharding is None else metadata.chunk_shape
+        self.chunk_shape, self.grid = metadata.chunk_shape, metadata.grid
+        self.together = metadata.together
         self.dimension_names = metadata.dimension_names
         self.attributes = metadata.attributes
         self._given: Mapping[Any, npt.NDArray[Any]] = {}
@@ -346,12 +345,8 @@ class StoredArray:
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
         """The values in `region`, in a new array.
 
-        Only the chunks that intersect the region are read; chunks of shards are decoded in several
-        threads. The container's cache keeps them, unless the whole array is read.
-
-        Where few chunks of a shard are needed, only their entries of its index are read. The
-        CRC-32C of the index then stays unread; but each chunk has one of its own, and `verify`
-        reads all.
+        Only the chunks that intersect the region are read, and decoded in several threads. The
+        container's cache keeps them, unless the whole array is read.
 
         Args:
             region: one slice without step per axis; None for the whole array.
@@ -466,7 +461,7 @@ class StoredArray:
 
     @property
     def coding(self) -> str:
-        """Name of the first codec, that of inner chunks where there are shards."""
+        """Name of the first codec."""
         return self._metadata.coding
 
     def _check_index(self, index: tuple[int, ...]) -> None:
@@ -494,9 +489,8 @@ class StoredArray:
 
         Raises DamagedFileError that names the member.
         """
-        if self.shard_shape is not None:
+        if self._metadata.indexed:
             self._file.check(self.number)
-            self._file.stored(self.number, [0] * len(self.shape))
         for _ in in_threads(self._decode_and_drop, product(*map(range, self.grid))):
             done()
 

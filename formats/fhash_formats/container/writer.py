@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from hashlib import sha256
 from itertools import product
 from math import prod
@@ -23,25 +23,10 @@ from fhash_formats.container.array import (
     ArrayMetadata,
     Codec,
     chunk_coder,
-    pack_index,
     plain_codecs,
-    sharding_codecs,
 )
-from fhash_formats.container.header import FORMAT, POSITIONS, TABLE, brief
-from fhash_formats.container.hierarchy import (
-    ARRAY,
-    CONSOLIDATED,
-    COORDINATES,
-    DIMENSIONS,
-    GROUP,
-    SHARES,
-    SHOWN_ATTRIBUTES,
-    VARIABLES,
-    array_path,
-    consolidated,
-    free_node,
-    shows_values,
-)
+from fhash_formats.container.header import FORMAT, brief
+from fhash_formats.container.hierarchy import GROUP, SHARES, VARIABLES, group_of
 from fhash_formats.container.reader import Container
 from fhash_formats.container.record import dumps
 from fhash_formats.container.source_entry import AUXILIARY
@@ -62,6 +47,7 @@ from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.files import replacing
 from fhash_formats.support.threads import slab_shape
 from fhash_formats.support.values import DTYPES, plain_json
+from fhash_formats.transform.stream import TILE_AXES
 
 Coded = npt.NDArray[Any] | bytes
 """A chunk to write: its values, or the bytes that the coder of its first codec made of them."""
@@ -81,45 +67,38 @@ def cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDA
         ]
 
 
-def member_parts(
+def member_chunks(
     name: str,
     metadata: ArrayMetadata,
     index: tuple[int, ...],
     chunks: Iterator[Coded | tuple[tuple[int, ...], Coded]],
 ) -> list[bytes]:
-    """The parts of a member, in the order of the file: a chunk, or the inner chunks of a shard in C
-    order, and its index.
+    """The chunks of a member, in the order in which they lie in it.
 
     Args:
         name: the array's, for messages.
         metadata: the array's.
-        index: of the chunk or the shard.
-        chunks: takes the inner chunks from here, each alone (then in C order) or with its index in
-            the array's grid of inner chunks (then in any order).
+        index: of the member.
+        chunks: takes the chunks from here, each alone (then in the order of the file) or with its
+            index in the array's grid (then in any order).
 
     Raises:
-        InputError: if an inner chunk is missing, given twice, or does not fit.
+        InputError: if a chunk is missing, given twice, or does not fit.
     """
-    sharding = metadata.sharding
-    expected = [index] if sharding is None else sharding.chunks_of(index, metadata.shape)
-    coded: dict[tuple[int, ...], bytes | None] = dict.fromkeys(expected)
+    coded: dict[tuple[int, ...], bytes | None] = dict.fromkeys(metadata.chunks_of(index))
     for place in list(coded):
         item = next(chunks, None)
         if item is None:
             raise InputError(
-                f"array {name}: chunk {place} was not given; the grid has {metadata.inner_grid}"
+                f"array {name}: chunk {place} was not given; the grid has {metadata.grid}"
             )
         at, chunk = item if isinstance(item, tuple) else (place, item)
         if coded.get(at, b"") is not None:
             raise InputError(
-                f"array {name}: chunk {at} is none of shard {index}, or was given twice"
+                f"array {name}: chunk {at} is none of member {index}, or was given twice"
             )
         coded[at] = coded_chunk(name, metadata, at, chunk)
-    inner_chunks = [data for data in coded.values() if data is not None]
-    if sharding is None:
-        return inner_chunks
-    sizes = [len(data) for data in inner_chunks]
-    return [*inner_chunks, pack_index(sizes, sharding.present(index, metadata.shape))]
+    return [data for data in coded.values() if data is not None]
 
 
 def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
@@ -139,15 +118,15 @@ def full_chunk(
 
     Raises InputError for a chunk of another shape or number type than the array needs at `index`.
     """
-    expected = tuple(span.stop - span.start for span in metadata.inner_region(index))
+    expected = tuple(span.stop - span.start for span in metadata.region(index))
     if chunk.shape != expected or chunk.dtype.newbyteorder("=") != metadata.dtype:
         raise InputError(
             f"array {name}: chunk {tuple(index)} is {chunk.dtype} {chunk.shape}; "
             f"{metadata.dtype} {expected} is needed"
         )
-    if expected == metadata.inner_shape:
+    if expected == metadata.chunk_shape:
         return chunk
-    full = np.zeros(metadata.inner_shape, dtype=metadata.dtype)
+    full = np.zeros(metadata.chunk_shape, dtype=metadata.dtype)
     full[tuple(slice(0, n) for n in expected)] = chunk
     return full
 
@@ -187,13 +166,7 @@ class _Variable:
     Attributes:
         name: among several; None for the only one.
         number: in the file, from 0.
-        node: name of its table at the root.
-        attributes: that its table shows.
         begun: bytes of the file with the variables before.
-        shown: whether the table lies at the root.
-        dimensions: names at the root by axis.
-        lengths: positions of the axes that are known.
-        boxes: names by axis of those axes of the table that have not every position.
         shares: number of a variable, and the array's name there if it has another, by name of an
             array that lies there.
         mark: of the file before its first array; None for the only variable.
@@ -202,19 +175,13 @@ class _Variable:
 
     name: str | None
     number: int
-    node: str
-    attributes: Mapping[str, Any]
     begun: int = 0
-    shown: bool = True
-    dimensions: dict[str, str] = field(default_factory=dict)
-    lengths: dict[str, int] = field(default_factory=dict)
-    boxes: dict[str, str] = field(default_factory=dict)
     shares: dict[str, Any] = field(default_factory=dict)
     mark: Mark | None = None
     written: dict[str, str] = field(default_factory=dict)
 
 
-CODED = ("shape", "data_type", "chunk_grid", "codecs", "fill_value")
+CODED = ("shape", "data_type", "chunk_grid", "codecs", "attributes")
 """Keys of an array's document that say how its numbers are coded."""
 
 
@@ -234,9 +201,9 @@ class ContainerWriter:
     """A container for writing; a context manager.
 
     The file takes its name in `commit`; without `commit` nothing is left behind. Members are
-    written once, in this order: for each array its metadata and its chunks, then the groups, then
-    the root. Identical calls give identical bytes. Entering raises OutputExistsError or
-    OutputError.
+    written once, in this order: the chunks of each array, then the documents of arrays and groups,
+    which one read finds together, then the root. Identical calls give identical bytes. Entering
+    raises OutputExistsError or OutputError.
 
     Arrays have the names of FORMAT.md; the writer finds their paths. Several variables are written
     one after the other, from `begin` to `finish`. Coordinates, arrays beside the data and whole
@@ -256,8 +223,7 @@ class ContainerWriter:
         Args:
             path: name that the file takes.
             force: allow it to replace an existing file.
-            variables: names of several variables, which are taken first, so that no coordinate
-                takes the place of a variable's values; none for a file of one variable.
+            variables: names of several variables; none for a file of one.
 
         Raises InputError for an empty name, and one that is there twice.
         """
@@ -272,54 +238,23 @@ class ContainerWriter:
         self.attributes: Mapping[str, Any] = {}
         self.one_of_several = bool(variables)
         self._variable: _Variable | None = None
+        self._names = list(variables)
         self._headers: list[dict[str, Any]] = []
-        self._nodes: dict[str, str] = {}
-        for name in variables:
-            self._nodes[name] = free_node(name, self._nodes.values())
-        self._names_taken = set(self._nodes.values())
-        self._coordinates: dict[str, tuple[Any, ...]] = {}
         self._auxiliary: dict[tuple[Any, ...], tuple[int, str]] = {}
         self._finished: dict[bytes, tuple[int, dict[tuple[str, str], Member]]] = {}
 
-    def begin(self, variable: Mapping[str, Any]) -> None:
-        """Begin a variable, whose table has a name as near as possible to that of the variable.
-
-        variable: `name`, `units` and `attributes`, as the header has them; the table gets its units
-            and those of SHOWN_ATTRIBUTES. Several variables have the names that were given for
-            them, in that order.
-        """
-        attributes = {**variable["attributes"], "units": variable["units"]}
-        shown = {key: attributes[key] for key in SHOWN_ATTRIBUTES if attributes.get(key)}
-        if self.one_of_several:
-            name = list(self._nodes)[len(self._headers)]
-            begun = self._position + len(self._tail()) if self._headers else 0
-            self._variable = _Variable(
-                name=name,
-                number=len(self._headers),
-                node=self._nodes[name],
-                attributes=shown,
-                begun=begun,
-                mark=self.mark(),
-            )
+    def begin(self) -> None:
+        """Begin a variable; several have the names that were given for them, in that order."""
+        if not self.one_of_several:
+            self._variable = _Variable(name=None, number=0)
             return
-        node = free_node(variable["name"], ())
-        self._variable = _Variable(name=None, number=0, node=node, attributes=shown)
-        self._names_taken = {node}
-
-    def name_axes(self, coordinates: Sequence[str], shape: Sequence[int]) -> list[str]:
-        """Give the axes of the variable names before their coordinates are written, if at all.
-
-        Returns the names, in the order of POSITIONS.
-
-        Args:
-            coordinates: names of the coordinates, in the order of POSITIONS.
-            shape: number of their positions.
-        """
-        variable = self._current()
-        for axis, name, length in zip(POSITIONS, coordinates, shape, strict=True):
-            variable.dimensions[axis] = self._free(name)
-            variable.lengths[axis] = length
-        return [variable.dimensions[axis] for axis in POSITIONS]
+        number = len(self._headers)
+        self._variable = _Variable(
+            name=self._names[number],
+            number=number,
+            begun=self._position + len(self._tail()) if self._headers else 0,
+            mark=self.mark(),
+        )
 
     def __enter__(self) -> ContainerWriter:
         with ExitStack() as stack:
@@ -346,25 +281,24 @@ class ContainerWriter:
         dtype: npt.DTypeLike,
         chunk_shape: Sequence[int],
         chunks: Iterable[Coded | tuple[tuple[int, ...], Coded]],
-        shard_shape: Sequence[int] | None = None,
+        together: Sequence[int] | None = None,
         dimension_names: Sequence[str | None] | None = None,
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
     ) -> None:
-        """Write an array; never more than one chunk, or the coded bytes of one shard, is held.
+        """Write an array; never more than the coded bytes of one member are held.
 
         Args:
             name: of the array (FORMAT.md, Arrays).
             shape: length of each axis.
             dtype: number type of the array and of each chunk.
             chunk_shape: shape of a full chunk.
-            chunks: the chunks in C order of their grid, or of shards in that of `shard_order`;
-                those at an end of the array reach as far as the array does. A chunk may also be the
-                bytes that the coder of its first codec made of the full chunk. Chunks of shards may
-                come as (index, chunk) with their index in the grid: then shards come in C order,
-                and the chunks of a shard in any order.
-            shard_shape: shape of a shard, a multiple of `chunk_shape`; None for no shards.
-            dimension_names: names of the axes.
+            chunks: the chunks, member by member in C order, those of a member in C order; those at
+                an end of the array reach as far as the array does. A chunk may also be the bytes
+                that the coder of its first codec made of the full chunk. Tiles may come as (index,
+                chunk) with their index in the grid: then those of a member come in any order.
+            together: tiles of a member along each axis; one by default.
+            dimension_names: names of the axes, of an array of numbers.
             attributes: JSON values.
             codecs: of the chunks, a list as in Zarr's metadata; by default `bytes`, `zstd`,
                 `crc32c`.
@@ -373,22 +307,25 @@ class ContainerWriter:
             InputError: for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
-        coding = plain_codecs(number_type) if codecs is None else codecs
-        if shard_shape is not None:
-            coding = sharding_codecs([int(n) for n in chunk_shape], coding)
-        member_shape = chunk_shape if shard_shape is None else shard_shape
-        metadata = self._begin(
-            name, shape, number_type, member_shape, coding, dimension_names, attributes
+        metadata = self._metadata(
+            name,
+            shape,
+            number_type,
+            chunk_shape,
+            codecs=plain_codecs(number_type) if codecs is None else codecs,
+            together=together,
+            dimension_names=dimension_names,
+            attributes=attributes,
         )
         remaining = iter(chunks)
-        for index in product(*(range(n) for n in metadata.grid)):
-            parts = member_parts(name, metadata, index, remaining)
-            self._add(name, metadata.chunk_key(index), parts)
+        for index in product(*(range(n) for n in metadata.members)):
+            self._add_member(name, metadata, index, member_chunks(name, metadata, index, remaining))
         if next(remaining, None) is not None:
-            grid = metadata.inner_grid
+            grid = metadata.grid
             raise InputError(
                 f"array {name}: more chunks were given than the {prod(grid)} of the grid {grid}"
             )
+        self._describe(name, metadata)
 
     def add_whole(
         self,
@@ -405,25 +342,18 @@ class ContainerWriter:
         By default an array of up to USUAL_CHUNK_BYTES is one chunk, and a larger one is cut into
         slabs along its leading axes. Arguments and errors are those of `add_array`.
 
-        A coordinate, or an array beside the data, is written only where no other variable has it.
-        The latter is coded as differences of neighbours where that takes fewer bytes.
+        An array beside the data is written only where no other variable has it, and coded as
+        differences of neighbours where that takes fewer bytes.
         """
         chunks: Iterable[Coded] | None = None
-        if name.startswith(COORDINATES):
-            attributes = dict(attributes or {})
-            wish = str(attributes.pop("name", name.removeprefix(COORDINATES)))
-            if self._has_coordinate(name.removeprefix(COORDINATES), wish, array, attributes):
-                return
-            if self._path(name) != wish:
-                attributes["name"] = wish
-        elif name.startswith(AUXILIARY):
+        if name.startswith(AUXILIARY):
             variable = self._current()
             content = (array.dtype.str, array.shape, sha256(array.tobytes()).digest())
             owner = self._auxiliary.setdefault(content, (variable.number, name))
             if owner[0] != variable.number:
                 variable.shares[name] = owner[0] if owner[1] == name else list(owner)
                 return
-            if codecs is None and chunk_shape is None and array.ndim <= len(POSITIONS):
+            if codecs is None and chunk_shape is None and array.ndim <= len(TILE_AXES):
                 chunk_shape = slab_shape(array.shape, array.dtype.itemsize, BESIDE_CHUNK_BYTES)
                 codecs, chunks = coded_beside(array, chunk_shape)
         if chunk_shape is None:
@@ -439,114 +369,59 @@ class ContainerWriter:
             codecs=codecs,
         )
 
-    def _begin(
+    def _metadata(
         self,
         name: str,
         shape: Sequence[int],
         dtype: np.dtype[Any],
         chunk_shape: Sequence[int],
+        *,
         codecs: Sequence[Codec],
-        dimension_names: Sequence[str | None] | None,
-        attributes: Mapping[str, Any] | None,
+        together: Sequence[int] | None = None,
+        dimension_names: Sequence[str | None] | None = None,
+        attributes: Mapping[str, Any] | None = None,
     ) -> ArrayMetadata:
-        """Write the metadata of an array."""
+        """The metadata of an array that can be stored. Raises InputError for another."""
         lengths, sides = [int(n) for n in shape], [int(n) for n in chunk_shape]
         fits = len(lengths) == len(sides) and 1 <= len(lengths) <= MAX_DIMENSIONS
         if not fits or min(*lengths, *sides) < 1 or dtype.name not in DTYPES:
             raise InputError(
                 f"array {name} cannot be stored: {dtype} of shape {lengths} in chunks of {sides}"
             )
-        metadata = ArrayMetadata(
-            shape=tuple(int(n) for n in shape),
-            dtype=dtype,
-            chunk_shape=tuple(int(n) for n in chunk_shape),
-            codecs=tuple(codecs),
-        )
-        names, shown = self._shown(name, metadata, dimension_names, attributes or {})
-        metadata = replace(
-            metadata,
-            dimension_names=None if names is None else tuple(names),
-            attributes=dict(shown),
-        )
-        document = dumps(metadata.to_dict(), f"the metadata of array {name}")
+        tiles = codecs[0]["name"] == TRANSFORM
         path = self._path(name)
-        self._check_name(path)
-        self._arrays[path] = metadata.to_dict()
-        self._current().written[name] = path
-        member, data = document_member(f"{path}/{DOCUMENT}", self._position, document)
-        self._write(member, [data])
-        return metadata
+        if not NAME.fullmatch(path) or len(path) > MAX_NAME // 2:
+            raise InputError(
+                f"array name {path[:80]!a} is not allowed; "
+                f"allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
+            )
+        if path in self._arrays:
+            raise InputError(f"array {path} is there already")
+        return ArrayMetadata(
+            shape=tuple(lengths),
+            dtype=dtype,
+            chunk_shape=tuple(sides),
+            codecs=tuple(codecs),
+            together=tuple(together or (1,) * len(lengths)) if tiles else None,
+            dimension_names=None if dimension_names is None else tuple(dimension_names),
+            attributes=dict(attributes or {}),
+        )
 
-    def _shown(
-        self,
-        name: str,
-        metadata: ArrayMetadata,
-        dimension_names: Sequence[str | None] | None,
-        attributes: Mapping[str, Any],
-    ) -> tuple[Sequence[str | None] | None, Mapping[str, Any]]:
-        """Names of the axes and attributes of an array, those of the source where it has some."""
-        if name.startswith(COORDINATES):
-            return [self._path(name)], attributes
-        if name != TABLE:
-            return dimension_names, attributes
-        variable = self._current()
-        variable.shown = shows_values(metadata)
-        if not variable.shown:
-            return dimension_names, attributes
-        axes = zip(POSITIONS, metadata.shape, strict=True)
-        return [self._dimension(*axis) for axis in axes], {**variable.attributes, **attributes}
-
-    def _dimension(self, axis: str, length: int) -> str:
-        """The name of an axis of the table: that of the coordinate only with every position."""
-        variable = self._current()
-        name = self._node_of(axis)
-        if variable.lengths.get(axis, length) == length:
-            return name
-        if axis not in variable.boxes:
-            variable.boxes[axis] = self._free(f"{name}_box")
-        return variable.boxes[axis]
-
-    def _has_coordinate(
-        self, axis: str, name: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]
-    ) -> bool:
-        """Give an axis a name at the root; whether the coordinate is there already."""
-        variable = self._current()
-        variable.lengths[axis] = len(values)
-        if axis in variable.dimensions:
-            return False
-        content = (name, values.tobytes(), dict(attributes))
-        used = set(variable.dimensions.values())
-        for node, other in self._coordinates.items():
-            if other == content and node not in used:
-                variable.dimensions[axis] = node
-                return True
-        wish = free_node(name, ())
-        node = self._free(f"{wish}_of_{variable.node}" if wish in self._names_taken else wish)
-        variable.dimensions[axis] = node
-        self._coordinates[node] = content
-        return False
+    def _describe(self, name: str, metadata: ArrayMetadata) -> None:
+        """Take the metadata of an array, whose document is written with those of all."""
+        values = metadata.to_dict()
+        dumps(values, f"the metadata of array {name}")
+        self._arrays[self._path(name)] = values
+        self._current().written[name] = self._path(name)
 
     def _current(self) -> _Variable:
         """The variable that is being written."""
         if self._variable is None:
             if self.one_of_several:
                 raise InputError(f"{self.path}: no variable has begun")
-            self.begin({"name": "values", "units": "", "attributes": {}})
+            self.begin()
         assert self._variable is not None
         return self._variable
-
-    def _free(self, wish: str) -> str:
-        """A name at the root that nothing has, which is taken from now on."""
-        node = free_node(wish, self._names_taken)
-        self._names_taken.add(node)
-        return node
-
-    def _node_of(self, axis: str) -> str:
-        """The name of an axis at the root."""
-        dimensions = self._current().dimensions
-        if axis not in dimensions:
-            dimensions[axis] = self._free(axis)
-        return dimensions[axis]
 
     def preview(self, header: Mapping[str, Any]) -> Container:
         """The variable as written so far, as if the file were committed with this header.
@@ -576,12 +451,12 @@ class ContainerWriter:
         Sizes and checksums find the earlier one, and the bytes are read back to be compared.
         """
         names = {path: name for name, path in variable.written.items() if path in self._arrays}
-        tables = {p: n for p, n in names.items() if not n.startswith((COORDINATES, AUXILIARY))}
+        tables = {p: n for p, n in names.items() if not n.startswith(AUXILIARY)}
         contents = {
             (name, member.name.removeprefix(path)): member
             for path, name in tables.items()
             for member in self._members[mark.members :]
-            if member.name.startswith(f"{path}/") and not member.name.endswith(f"/{DOCUMENT}")
+            if member.name.startswith(f"{path}/")
         }
         coded = [[name, *map(self._arrays[path].get, CODED)] for path, name in tables.items()]
         sizes = [(place, member.size, member.crc) for place, member in contents.items()]
@@ -602,7 +477,7 @@ class ContainerWriter:
         variable.shares |= dict.fromkeys(tables.values(), number)
 
     def commit(self, header: Mapping[str, Any] | None = None) -> int:
-        """Write the groups, the root with the headers and the directory; give the file its name.
+        """Write the documents, the root with the headers and the directory; name the file.
 
         `format` and `format_version` are added. Figures that JSON cannot hold become null.
 
@@ -672,15 +547,21 @@ class ContainerWriter:
         entry: dict[str, Any] = plain_json(header)
         if variable.name not in (None, entry.get("variable", {}).get("name")):
             entry["name"] = variable.name
-        entry.pop(ARRAY, None)
-        if variable.node in self._arrays:
-            entry[ARRAY] = variable.node
-        entry[DIMENSIONS] = [self._node_of(axis) for axis in POSITIONS]
         if variable.shares:
             entry[SHARES] = variable.shares
+        if variable.number:
+            entry["coordinates"] = self._once(entry.get("coordinates", {}))
         return entry
 
-    def _root(self, groups: Collection[str], entries: Sequence[Mapping[str, Any]]) -> bytes:
+    def _once(self, coordinates: Mapping[str, Any]) -> dict[str, Any]:
+        """Coordinates, with the number of an earlier variable in place of what it has as well."""
+        known = [header.get("coordinates", {}) for header in self._headers]
+        return {
+            axis: next((n for n, one in enumerate(known) if one.get(axis) == described), described)
+            for axis, described in coordinates.items()
+        }
+
+    def _root(self, entries: Sequence[Mapping[str, Any]]) -> bytes:
         """The document of the root."""
         features = [name for entry in entries for name in entry.get("required_features", ())]
         of_root = {
@@ -693,13 +574,10 @@ class ContainerWriter:
             for entry in entries
         ]
         attributes = {**plain_json(self.attributes), "fhash": {**of_root, VARIABLES: variables}}
-        root: dict[str, Any] = {**GROUP, "attributes": attributes}
-        if len(entries) > 1:
-            root[CONSOLIDATED] = consolidated({**dict.fromkeys(groups, GROUP), **self._arrays})
-        return dumps(root, "the header")
+        return dumps({**GROUP, "attributes": attributes}, "the header")
 
     def _tail(self, header: Mapping[str, Any] | None = None) -> bytes:
-        """The bytes after the arrays: groups, root and directory.
+        """The bytes after the chunks: documents, the root last, and directory.
 
         header: of the variable that is being written; None where all are finished.
         """
@@ -711,8 +589,9 @@ class ContainerWriter:
             for folders in (name.split("/")[:-1] for name in self._arrays)
             for depth in range(1, len(folders) + 1)
         }
-        documents = {f"{group}/{DOCUMENT}": dumps(GROUP, "a group") for group in sorted(groups)}
-        documents[DOCUMENT] = self._root(groups, entries)
+        nodes = self._arrays | dict.fromkeys(sorted(groups), GROUP)
+        documents = {f"{path}/{DOCUMENT}": dumps(node, path) for path, node in nodes.items()}
+        documents[DOCUMENT] = self._root(entries)
         members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():
             member, packed = document_member(name, position, data)
@@ -721,32 +600,27 @@ class ContainerWriter:
             position = member.end
         return b"".join([*tail, ending(members)])
 
-    def _check_name(self, name: str) -> None:
-        if not NAME.fullmatch(name) or len(name) > MAX_NAME // 2:
-            raise InputError(
-                f"array name {name[:80]!a} is not allowed; "
-                f"allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
-            )
-        if name in self._arrays:
-            raise InputError(f"array {name} is there already")
-
     def _path(self, name: str) -> str:
         """The path of an array in the hierarchy."""
-        if name.startswith(COORDINATES):
-            return self._node_of(name.removeprefix(COORDINATES))
-        variable = self._current()
-        return (
-            variable.node if name == TABLE and variable.shown else array_path(variable.number, name)
-        )
+        number = self._current().number
+        return group_of(number) + name if self.one_of_several else name
 
-    def _add(self, name: str, key: str, parts: Sequence[bytes]) -> None:
-        """Write the member of a chunk of an array, whose data are `parts`, one after the other."""
+    def _add_member(
+        self, name: str, metadata: ArrayMetadata, index: tuple[int, ...], chunks: Sequence[bytes]
+    ) -> None:
+        """Write a member of an array, and the chunk of the index that says what lies in it."""
+        self._add(f"{self._path(name)}/{metadata.member_name(index)}", chunks)
+        if metadata.indexed:
+            sizes = metadata.index_chunk(index, [len(chunk) for chunk in chunks])
+            place = "/".join(str(i) for i in index)
+            self._add(f"{self._path(name)}/c/{place}", [sizes])
+
+    def _add(self, member: str, parts: Sequence[bytes]) -> None:
+        """Write a member whose data are `parts`, one after the other."""
         size, crc = sum(len(part) for part in parts), 0
-        member = f"{self._path(name)}/{key}"
         if size > MAX_MEMBER:
             raise InputError(
-                f"{member} takes {size} bytes; the limit is {MAX_MEMBER}; "
-                "take smaller chunks or shards"
+                f"{member} takes {size} bytes; the limit is {MAX_MEMBER}; take smaller chunks"
             )
         for part in parts:
             crc = zlib.crc32(part, crc)

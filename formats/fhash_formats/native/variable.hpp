@@ -5,13 +5,13 @@
 
 namespace fhash {
 
-extern const char* const COORDINATES[4];  // "coords/time" and so on
+extern const char* const AXES[4];  // "time" and so on
 constexpr int64_t MAX_LEVELS = 64;
 
 struct Variable {
     Record top, header;  // of the file, and of the variable
     std::string name, units, attributes;  // the last as JSON text
-    std::string dimensions[4];
+    Json coordinates[4] = {};  // objects of the header; null for whole numbers from 0 on
     std::map<std::string, const Array*> arrays;  // by name (FORMAT.md, Arrays)
     int32_t type = 0;                            // of the source
     int64_t shape[4] = {};
@@ -38,8 +38,8 @@ struct Variable {
 // The variables of a file, complete and checked.
 bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error);
 
-// Positions along an axis that stand in the header.
-bool header_positions(const Variable& variable, int axis, double* positions, fhash_error& error);
+// Positions along an axis, `shape[axis]` of them.
+void find_positions(const Variable& variable, int axis, double* positions);
 
 // Bytes of the occupancy of a key frame; 0 beyond 2^59.
 int64_t occupancy_bytes(const Variable& variable);

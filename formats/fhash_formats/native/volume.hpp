@@ -26,10 +26,6 @@ struct Frame {
 int32_t detail_levels(const Variable& variable);
 int64_t tile_length(const Variable& variable, int axis);
 
-// Positions along an axis, `shape[axis]` of them.
-bool read_positions(fhash_file& file, const Variable& variable, int axis, double* positions,
-                    fhash_error& error);
-
 // The key index of a step: a whole number at each key frame.
 bool find_key(fhash_file& file, const Variable& variable, double step, double& key,
               fhash_error& error);
@@ -45,7 +41,7 @@ bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice
 bool read_plain(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                 Frame& frame, fhash_error& error);
 
-// Adds to a mask where the occupancy of the box at a key frame is 1 (occupancy/bits or mask).
+// Adds to a mask where the occupancy of the box at a key frame is 1 (occupancy).
 bool add_occupancy(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                    Buffer& mask, fhash_error& error);
 

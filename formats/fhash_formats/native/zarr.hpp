@@ -3,6 +3,7 @@
 #pragma once
 
 #include <map>
+#include <memory>
 #include <set>
 
 #include "json.hpp"
@@ -13,21 +14,24 @@ namespace fhash {
 constexpr int MAX_AXES = 8;
 using Lengths = std::array<int64_t, MAX_AXES>;  // one number for each axis of an array
 
-// An array. An inner chunk is what is decoded at once: a chunk, or one of a shard.
+// An array. An inner chunk is what is decoded at once: a chunk, or a tile, of which a member of the
+// file may hold several.
 struct Array {
     std::string path;
     uint32_t number = 0;  // of the array in the file
     int axes = 0;
     Lengths shape = {}, chunk = {}, inner = {};
     int32_t type = 0;
-    bool sharded = false;
-    bool tiles = false;  // coded by fhash.transform, else bytes, zstd and crc32c
+    std::shared_ptr<Array> index;  // of tiles: how many bytes each has; null for an ordinary array
+    bool together = false;         // whether members have several tiles
     std::string settings;  // packed, of tiles; empty where each stream has its own
     int places[MAX_AXES] = {};  // axis of the tile (0 to 3 for t, z, y, x) of each axis, or -1
     bool usual = true;  // whether the axes are the last of t, z, y, x
     Json attributes = nullptr;  // an object, or null for none
     std::vector<uint32_t> members;  // of the chunks, in C order
 
+    // Whether it is coded by fhash.transform, else bytes, zstd and crc32c.
+    bool tiles() const { return index != nullptr; }
     // Whether tiles say which of their values are occupied.
     bool masked() const { return !settings.empty() && (uint8_t(settings[0]) & 64); }
     int64_t count(const Lengths& lengths, int axis) const {

@@ -32,6 +32,15 @@ bool read_bounds(const Array& array, const int64_t* bounds, bool padded, Region&
     return true;
 }
 
+// The members of an array, those of the index of tiles among them; none of no array.
+std::vector<uint32_t> members_of(const Array* array) {
+    std::vector<uint32_t> found;
+    if (array) found = array->members;
+    if (array && array->together)
+        found.insert(found.end(), array->index->members.begin(), array->index->members.end());
+    return found;
+}
+
 // The region of a chunk, with its padding.
 Region region_of(const Array& array, const int64_t* place) {
     Region region;
@@ -90,8 +99,8 @@ int32_t fhash_file_node(const fhash_file* file, int64_t number, fhash_node* node
     const Array* const array = opened.hierarchy.find(found.path);
     node->array = array ? array->number : 0;
     node->stored = 0;
-    for (size_t i = 0; array && i < array->members.size(); i++) {
-        const Member& member = opened.directory.members[array->members[i]];
+    for (const uint32_t number : members_of(array)) {
+        const Member& member = opened.directory.members[number];
         node->stored += member.size;
         node->place += member.end() - member.offset + entry_size(member);
     }
@@ -206,7 +215,7 @@ int32_t fhash_array_check(fhash_file* file, int64_t number, fhash_error* error) 
     return reported(error, [&](fhash_error& failed) {
         const Array* const array = array_of(file, number, failed);
         if (!array) return false;
-        for (const uint32_t member : array->members)
+        for (const uint32_t member : members_of(array))
             if (!check_pieces(*file, file->directory.members[member], failed)) return false;
         return true;
     });

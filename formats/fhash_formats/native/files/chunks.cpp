@@ -11,13 +11,9 @@ namespace fhash {
 
 namespace {
 
-constexpr uint64_t ABSENT = ~uint64_t(0);
-constexpr uint64_t INDEX_ENTRY = 16;       // bytes of an inner chunk in the index of its shard
 constexpr uint64_t CHUNK_GAP = 16 << 10;   // bytes between two chunks that are read as well
 constexpr uint64_t CHUNK_READ = 8 << 20;   // bytes of a read of several chunks
 constexpr uint64_t FAR_READ = 2 << 20;     // the same where reads are announced, and made at once
-constexpr uint64_t SMALL_INDEX = 16 << 10; // bytes up to which all of an index is read
-constexpr uint64_t SHARE = 4;              // as is one of which that share is needed
 constexpr uint64_t INDEX = 1000;           // in the place of a level of detail, in the cache
 constexpr uint64_t UNCORRECTED = 1001;     // likewise: tiles before their head
 constexpr uint64_t APART = 1002;           // likewise: how many parts of a tile were decoded
@@ -36,7 +32,7 @@ struct Wanted {
     uint64_t number;    // in the grid of inner chunks
     bool ahead;         // whether nobody asked for it yet
     Stored stored;
-    uint64_t in_shard;  // number in the shard
+    uint64_t within;    // number in its member
 };
 
 bool check_crc(const uint8_t* data, size_t size, fhash_error& error) {
@@ -104,13 +100,13 @@ fhash_tile tile_of(const Array& array) {
 
 // Whether a part of a tile may be had sooner than all of it: the head need not see the rest.
 bool is_parted(const Array& array) {
-    const bool headed = array.tiles && !array.settings.empty() && (uint8_t(array.settings[0]) & 32);
+    const bool headed = array.tiles() && !array.settings.empty() && (uint8_t(array.settings[0]) & 32);
     return headed && !array.masked() && array.usual && array.axes == 4;
 }
 
 // Whether a part of a tile may be had from some of its blocks.
 bool is_boxed(const Array& array) {
-    return array.tiles && !array.masked() && array.usual && array.axes == 4;
+    return array.tiles() && !array.masked() && array.usual && array.axes == 4;
 }
 
 // Makes room for a part of a tile, first and last positions along t, z, y, x.
@@ -161,7 +157,7 @@ bool decode_tile(fhash_context& context, const Array& array, const uint8_t* data
 
 bool decode_chunk(fhash_context& context, const Array& array, const uint8_t* data, size_t size,
                   int lod, Chunk& chunk, fhash_error& error) {
-    if (array.tiles) return decode_tile(context, array, data, size, lod, chunk, error);
+    if (array.tiles()) return decode_tile(context, array, data, size, lod, chunk, error);
     if (lod) return fail(error, FHASH_ERROR_ARGUMENT, "the array has no levels of detail");
     const uint64_t bytes = array.inner_values() * fhash_type_size(array.type);
     chunk.shape = array.inner;
@@ -169,160 +165,113 @@ bool decode_chunk(fhash_context& context, const Array& array, const uint8_t* dat
            zstd_exact(data, size - 4, bytes, bytes, chunk.values, error);
 }
 
-// Where inner chunks lie in their shards.
+// Where inner chunks lie in their members.
 struct Indices {
     fhash_file& file;
     const Array& array;
 
-    uint64_t chunks() const {
-        uint64_t product = 1;
-        for (int a = 0; a < array.axes; a++) product *= uint64_t(array.per_chunk(a));
-        return product;
+    const Member& member_of(const Array& of, uint64_t number) const {
+        return file.directory.members[of.members[size_t(number)]];
     }
 
-    uint64_t index_bytes() const { return chunks() * INDEX_ENTRY + 4; }
-    const Member& member_of(uint64_t shard) const {
-        return file.directory.members[array.members[size_t(shard)]];
-    }
-
-    // What is read of the index of a shard for the entries from `first` to `last`.
-    struct Span {
-        uint64_t offset, length;
-        bool whole;
-    };
-    Span span_of(uint64_t shard, uint64_t first, uint64_t last) const {
-        const bool whole =
-            index_bytes() <= SMALL_INDEX || (last - first + 1) * SHARE >= chunks();
-        const uint64_t start = member_of(shard).data_offset() + member_of(shard).size -
-                               index_bytes();
-        if (whole) return {start, index_bytes(), true};
-        return {start + first * INDEX_ENTRY, (last - first + 1) * INDEX_ENTRY, false};
-    }
-
-    // Which inner chunks of a shard hold a vertex of the array.
-    bool present(uint64_t shard, uint64_t number) const {
+    // Whether tile `within` of member `number` holds a vertex of the array.
+    bool present(uint64_t number, uint64_t within) const {
         for (int a = array.axes - 1; a >= 0; a--) {
             const uint64_t along = uint64_t(array.per_chunk(a));
-            const uint64_t shards = uint64_t(array.count(array.chunk, a));
-            const uint64_t at = shard % shards * along + number % along;
+            const uint64_t members = uint64_t(array.count(array.chunk, a));
+            const uint64_t at = number % members * along + within % along;
             if (at >= uint64_t(array.count(array.inner, a))) return false;
-            shard /= shards;
-            number /= along;
+            number /= members;
+            within /= along;
         }
         return true;
     }
 
-    // Checks that the inner chunks of a shard fill it in order.
-    bool check(uint64_t shard, const Buffer& entries, uint64_t data_bytes,
-               fhash_error& error) const {
+    // Where each tile of a member begins in its data, of the bytes that the index says of each; the
+    // tiles fill the member.
+    bool add_up(uint64_t number, const Buffer& sizes, Buffer& starts, fhash_error& error) const {
+        const size_t count = sizes.size() / 4;
+        const uint64_t size = member_of(array, number).size;
         uint64_t position = 0;
-        for (uint64_t number = 0; number < entries.size() / INDEX_ENTRY; number++) {
-            const uint64_t offset = from_little(entries.data() + INDEX_ENTRY * number, 8);
-            const uint64_t length = from_little(entries.data() + INDEX_ENTRY * number + 8, 8);
-            const bool there = present(shard, number);
-            const bool good = there ? offset == position && length <= data_bytes - position
-                                    : offset == ABSENT && length == ABSENT;
-            if (!good)
-                return fail(error, FHASH_ERROR_DAMAGED,
-                            "the index of the shard has inner chunks that are missing, overlap, "
-                            "leave gaps or are not in order");
-            if (there) position += length;
+        starts.resize(8 * (count + 1));
+        for (size_t i = 0; i <= count; i++) {
+            std::memcpy(starts.data() + 8 * i, &position, 8);
+            const uint64_t next = i < count ? from_little(sizes.data() + 4 * i, 4) : 0;
+            if (next > size - position || (next && !present(number, i)))
+                return fail(error, FHASH_ERROR_DAMAGED, "the index of its tiles has other bytes");
+            position += next;
         }
-        return position == data_bytes ||
-               fail(error, FHASH_ERROR_DAMAGED, "the index of the shard leaves bytes out");
+        return position == size ||
+               fail(error, FHASH_ERROR_DAMAGED, "the index of its tiles leaves bytes out");
     }
 
-    // The entries of a shard from number `first` to `last`, or all of them: their first number is
-    // shape[0] of the chunk.
-    ChunkPointer entries(uint64_t shard, uint64_t first, uint64_t last, fhash_error& error) {
-        const Cache::Key key = {array.number, shard, INDEX};
-        ChunkPointer found = file.cache.get(key);
-        if (found && uint64_t(found->shape[0]) <= first &&
-            last < uint64_t(found->shape[0]) + found->values.size() / INDEX_ENTRY)
-            return found;
-        const Member& member = member_of(shard);
-        const Span span = span_of(shard, first, last);
-        if (member.size < index_bytes()) {
-            fail(error, FHASH_ERROR_DAMAGED, "member %s: too few bytes for the index of a shard",
-                 member.name.c_str());
+    // The same from the file, or from the cache.
+    ChunkPointer starts(uint64_t number, fhash_error& error) {
+        const Cache::Key key = {array.number, number, INDEX};
+        if (ChunkPointer found = file.cache.get(key)) return found;
+        const Member& member = member_of(*array.index, number);
+        const uint64_t header = member.data_offset() - member.offset;
+        const std::shared_ptr<Chunk> made = std::make_shared<Chunk>();
+        Buffer bytes;
+        Chunk sizes;
+        if (!file.source.read(member.offset, member.end() - member.offset, bytes, error))
+            return nullptr;
+        if (!check_member(member, bytes.data(), error) ||
+            !decode_chunk(*file.context, *array.index, bytes.data() + header, size_t(member.size),
+                          0, sizes, error)) {
+            fail_in(error, "member " + member.name);
             return nullptr;
         }
-        const std::shared_ptr<Chunk> made = std::make_shared<Chunk>();
-        made->shape[0] = span.whole ? 0 : int64_t(first);
-        Buffer& bytes = made->values;
-        if (!file.source.read(span.offset, span.length, bytes, error)) return nullptr;
-        if (span.whole) {
-            const bool good = check_crc(bytes.data(), bytes.size(), error);
-            bytes.resize(bytes.size() - 4);
-            if (!good || !check(shard, bytes, member.size - index_bytes(), error)) {
-                fail_in(error, "member " + member.name);
-                return nullptr;
-            }
+        if (!add_up(number, sizes.values, made->values, error)) {
+            fail_in(error, "member " + member_of(array, number).name);
+            return nullptr;
         }
         file.cache.put(key, made);
         return made;
     }
 
-    bool locate(const Chunk& entries, const Member& member, Wanted& wanted,
-                fhash_error& error) const {
-        const uint64_t at = wanted.in_shard - uint64_t(entries.shape[0]);
-        const uint64_t offset = from_little(entries.values.data() + INDEX_ENTRY * at, 8);
-        const uint64_t length = from_little(entries.values.data() + INDEX_ENTRY * at + 8, 8);
-        const uint64_t data_bytes = member.size - index_bytes();
-        if (length > data_bytes || offset > data_bytes - length)
-            return fail(error, FHASH_ERROR_DAMAGED,
-                        "member %s: an inner chunk is missing or reaches beyond the shard",
-                        member.name.c_str());
-        wanted.stored.offset = member.data_offset() + offset;
-        wanted.stored.length = length;
-        return true;
-    }
-
-    // The first and the last number of some inner chunks in their shard.
-    static std::pair<uint64_t, uint64_t> ends(const std::vector<Wanted*>& of) {
-        const auto order = [](const Wanted* a, const Wanted* b) {
-            return a->in_shard < b->in_shard;
-        };
-        const auto found = std::minmax_element(of.begin(), of.end(), order);
-        return {(*found.first)->in_shard, (*found.second)->in_shard};
+    // Finds the member of an inner chunk, and its number there; the place, where it is alone.
+    uint64_t find_member(Wanted& wanted) const {
+        uint64_t number = 0;
+        wanted.within = 0;
+        for (int a = 0; a < array.axes; a++) {
+            const int64_t along = array.per_chunk(a);
+            number = number * uint64_t(array.count(array.chunk, a)) +
+                     uint64_t(wanted.place[a] / along);
+            wanted.within = wanted.within * uint64_t(along) + uint64_t(wanted.place[a] % along);
+        }
+        const Member& member = member_of(array, number);
+        wanted.stored.member = array.members[size_t(number)];
+        wanted.stored.offset = member.offset;
+        wanted.stored.length = member.end() - member.offset;
+        wanted.stored.skip = member.data_offset() - member.offset;
+        return number;
     }
 
     bool locate_all(std::vector<Wanted>& wanted, fhash_error& error) {
-        std::map<uint64_t, std::vector<Wanted*>> shards;
+        std::map<uint64_t, std::vector<Wanted*>> members;
         for (Wanted& each : wanted) {
-            uint64_t shard = 0, number = 0;
-            for (int a = 0; a < array.axes; a++) {
-                const int64_t along = array.per_chunk(a);
-                shard = shard * uint64_t(array.count(array.chunk, a)) +
-                        uint64_t(each.place[a] / along);
-                number = number * uint64_t(along) + uint64_t(each.place[a] % along);
-            }
-            each.stored.member = array.members[size_t(shard)];
-            each.in_shard = number;
-            if (array.sharded) {
-                shards[shard].push_back(&each);
-                continue;
-            }
-            const Member& member = member_of(shard);
-            each.stored.offset = member.offset;
-            each.stored.length = member.end() - member.offset;
-            each.stored.skip = member.data_offset() - member.offset;
+            const uint64_t number = find_member(each);
+            if (array.together) members[number].push_back(&each);
         }
         std::vector<uint64_t> ranges;
-        for (const auto& shard : shards) {
-            if (!file.source.announced || member_of(shard.first).size < index_bytes()) continue;
-            if (file.cache.get({array.number, shard.first, INDEX})) continue;
-            const auto [first, last] = ends(shard.second);
-            const Span span = span_of(shard.first, first, last);
-            ranges.insert(ranges.end(), {span.offset, span.length});
+        for (const auto& each : members) {
+            if (!file.source.announced || file.cache.get({array.number, each.first, INDEX}))
+                continue;
+            const Member& member = member_of(*array.index, each.first);
+            ranges.insert(ranges.end(), {member.offset, member.end() - member.offset});
         }
         file.source.announce(ranges);
-        for (const auto& shard : shards) {
-            const auto [first, last] = ends(shard.second);
-            const ChunkPointer found = entries(shard.first, first, last, error);
+        for (const auto& each : members) {
+            const ChunkPointer found = starts(each.first, error);
             if (!found) return false;
-            for (Wanted* each : shard.second)
-                if (!locate(*found, member_of(shard.first), *each, error)) return false;
+            for (Wanted* one : each.second) {
+                const uint8_t* const at = found->values.data() + 8 * one->within;
+                const uint64_t start = from_little(at, 8), stop = from_little(at + 8, 8);
+                one->stored.offset += one->stored.skip + start;
+                one->stored.length = stop - start;
+                one->stored.skip = 0;
+            }
         }
         return true;
     }
@@ -403,7 +352,7 @@ struct Reading {
 
     bool decode(const Wanted& wanted, const uint8_t* data, Decoded& decoded, fhash_error& error) {
         const Member& member = file.directory.members[wanted.stored.member];
-        if (!array.sharded && !check_member(member, data, error)) return false;
+        if (!array.together && !check_member(member, data, error)) return false;
         const uint8_t* const stream = data + wanted.stored.skip;
         const size_t size = size_t(wanted.stored.length - wanted.stored.skip);
         bool done = false, good = true;
@@ -422,7 +371,7 @@ struct Reading {
                                 error);
         if (good) return true;
         std::string name = "member " + member.name;
-        if (array.sharded) name += ": inner chunk " + std::to_string(wanted.in_shard);
+        if (array.together) name += ": tile " + std::to_string(wanted.within);
         return fail_in(error, name);
     }
 
@@ -642,7 +591,7 @@ static void add_ahead(fhash_file& file, const Grid& grid, Indices& indices,
     const uint64_t each = array.inner_values() * fhash_type_size(array.type);
     // They and those of the read take half of the cache at most.
     const uint64_t most = std::min(uint64_t(file.context->threads), file.cache.limit / each / 2);
-    if (!layers || wanted.empty() || !array.sharded) return;
+    if (!layers || wanted.empty() || !array.together) return;
     Lengths from = grid.first, to = grid.last;
     from[0] = grid.last[0];
     to[0] = std::min(from[0] + layers, array.count(array.inner, 0));

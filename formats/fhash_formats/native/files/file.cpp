@@ -66,28 +66,16 @@ int32_t read_stream(void* user, uint64_t offset, uint64_t length, void* bytes) {
            std::fread(bytes, 1, size_t(length), stream) != size_t(length);
 }
 
-// Position along an axis and the JSON object of its name and attributes.
+// The JSON object of the name and the attributes of a coordinate.
 bool describe(const Variable& variable, int axis, std::string& text, fhash_error& error) {
-    const Array* const array = variable.find(COORDINATES[axis]);
-    const char* const axes[4] = {"time", "z", "y", "x"};
-    const Json rule = yyjson_obj_get(variable.header.find("coordinates"), axes[axis]);
-    const Json source = array ? array->attributes : rule;
-    const Json own = yyjson_obj_get(source, "name");
-    const std::string usual = array ? array->path : variable.dimensions[axis];
-    if (own && !yyjson_is_str(own))
-        return fail(error, FHASH_ERROR_DAMAGED, "the name of a coordinate is no text");
+    const Json name = yyjson_obj_get(variable.coordinates[axis], "name");
+    const Json kept = yyjson_obj_get(variable.coordinates[axis], "attributes");
     yyjson_mut_doc* const made = yyjson_mut_doc_new(nullptr);
     yyjson_mut_val* const root = yyjson_mut_obj(made);
-    yyjson_mut_val* const attributes = yyjson_mut_obj(made);
     yyjson_mut_doc_set_root(made, root);
-    yyjson_mut_obj_add_str(made, root, "name", own ? yyjson_get_str(own) : usual.c_str());
-    yyjson_obj_iter iter =
-        yyjson_obj_iter_with(array ? source : yyjson_obj_get(rule, "attributes"));
-    while (Json key = yyjson_obj_iter_next(&iter))
-        if (!array || !yyjson_equals_str(key, "name"))
-            yyjson_mut_obj_add(attributes, yyjson_val_mut_copy(made, key),
-                               yyjson_val_mut_copy(made, yyjson_obj_iter_get_val(key)));
-    yyjson_mut_obj_add_val(made, root, "attributes", attributes);
+    yyjson_mut_obj_add_str(made, root, "name", name ? yyjson_get_str(name) : AXES[axis]);
+    yyjson_mut_obj_add_val(made, root, "attributes",
+                           kept ? yyjson_val_mut_copy(made, kept) : yyjson_mut_obj(made));
     char* const written = yyjson_mut_write(made, 0, nullptr);
     yyjson_mut_doc_free(made);
     if (!written) return fail(error, FHASH_ERROR_MEMORY, "no memory for attributes");
@@ -97,19 +85,6 @@ bool describe(const Variable& variable, int axis, std::string& text, fhash_error
 }
 
 }  // namespace
-
-bool read_positions(fhash_file& file, const Variable& variable, int axis, double* positions,
-                    fhash_error& error) {
-    const Array* const array = variable.find(COORDINATES[axis]);
-    if (!array) return header_positions(variable, axis, positions, error);
-    Region all;
-    all.last = array->shape;
-    Buffer bytes;
-    if (!read_region(file, *array, all, bytes, nullptr, error)) return false;
-    std::memcpy(positions, bytes.data(), bytes.size());
-    return true;
-}
-
 }  // namespace fhash
 
 using namespace fhash;
@@ -213,7 +188,7 @@ int32_t fhash_coordinate(fhash_file* file, int32_t number, int32_t axis, double*
             axis > 3 || !positions)
             return fail(failed, FHASH_ERROR_ARGUMENT, "the file has no such axis");
         const Variable& variable = file->variables[size_t(number)];
-        if (!read_positions(*file, variable, axis, positions, failed)) return false;
+        find_positions(variable, axis, positions);
         if (!attributes) return true;
         std::string text;
         if (!describe(variable, axis, text, failed)) return false;

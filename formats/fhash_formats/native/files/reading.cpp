@@ -69,7 +69,7 @@ struct Frames {
 
 // Takes out of a mask the vertices that had no finite value at a step or one beside it.
 bool take_missing(const Call& call, double step, Buffer& mask, fhash_error& error) {
-    const Array* const array = call.variable.find("missing/bits");
+    const Array* const array = call.variable.find("missing");
     if (!array) return true;
     const int64_t* const shape = call.variable.shape;
     const int64_t* const box = call.variable.box;

@@ -6,47 +6,14 @@
 
 namespace fhash {
 
-const char* const COORDINATES[4] = {"coords/time", "coords/z", "coords/y", "coords/x"};
+const char* const AXES[4] = {"time", "z", "y", "x"};
 
 namespace {
 
-constexpr int64_t MAX_RULED = 1 << 20;  // positions that a header describes
+constexpr int64_t MAX_RULED = 1 << 26;   // positions of a rule
+constexpr int64_t MAX_LISTED = 1 << 20;  // numbers of a list
 constexpr int64_t ULPS_LIMIT = (int64_t(1) << 52) - 1;
-const char* const AXES[4] = {"time", "z", "y", "x"};
 const char* const FEATURES[3] = {"transform", "plain", "sparse-tables"};
-
-bool is_node(const std::string& name) {
-    const auto fits = [](char letter) {
-        return (letter >= 'A' && letter <= 'Z') || (letter >= 'a' && letter <= 'z') ||
-               (letter >= '0' && letter <= '9') || letter == '_' || letter == '-';
-    };
-    return !name.empty() && name.size() <= 100 && name != "parts" &&
-           std::all_of(name.begin(), name.end(), fits);
-}
-
-// The path of an array of a variable in `parts`.
-std::string part_path(size_t number, const std::string& name) {
-    std::string path = "parts/" + std::to_string(number) + ".";
-    for (const char letter : name) {
-        if (letter == '.') path += "..";
-        else path += letter == '/' ? '.' : letter;
-    }
-    return path;
-}
-
-// The number of the variable and the name of an array in `parts`; false for other paths.
-bool split_part(const std::string& path, size_t count, size_t& number, std::string& name) {
-    const size_t dot = path.find('.');
-    if (dot == std::string::npos || dot < 7 || dot > 16) return false;
-    number = size_t(std::strtoull(path.c_str() + 6, nullptr, 10));
-    name.clear();
-    for (size_t i = dot + 1; i < path.size(); i++) {
-        const bool pair = path[i] == '.' && i + 1 < path.size() && path[i + 1] == '.';
-        name += path[i] == '.' && !pair ? '/' : path[i];
-        i += pair;
-    }
-    return number < count && !name.empty() && part_path(number, name) == path;
-}
 
 bool has_feature(const Record& top, const char* feature) {
     const Json list = top.find("required_features");
@@ -190,6 +157,16 @@ bool read_model(Variable& variable, fhash_error& error) {
            model.need(variable.plain || variable.levels.size() == 1, "levels", "one level", error);
 }
 
+// A position of a list: a number, or the text of one that is not finite.
+bool listed_position(Json value, double& position) {
+    position = yyjson_get_num(value);
+    if (yyjson_equals_str(value, "NaN")) position = NAN;
+    else if (yyjson_equals_str(value, "Infinity")) position = HUGE_VAL;
+    else if (yyjson_equals_str(value, "-Infinity")) position = -HUGE_VAL;
+    else return yyjson_is_num(value) && std::isfinite(position);
+    return true;
+}
+
 bool check_positions(const Record& record, int64_t length, fhash_error& error) {
     double number = 0;
     std::string text;
@@ -204,32 +181,40 @@ bool check_positions(const Record& record, int64_t length, fhash_error& error) {
                      "dtype", "float64 or float32", error) ||
         !record.need(!attributes || yyjson_is_obj(attributes), "attributes", "an object", error))
         return false;
-    if (values) {
-        std::vector<double> listed;
-        listed.resize(size_t(length));
-        if (!record.numbers("values", size_t(length), listed.data(), error)) return false;
-    }
-    if (!ulps) return true;
-    const size_t count = yyjson_is_arr(ulps) ? yyjson_arr_size(ulps) : 0;
-    bool good = count >= 1 && int64_t(count) <= length && !values;
-    yyjson_arr_iter iter = yyjson_arr_iter_with(good ? ulps : nullptr);
+    const int64_t count = int64_t(yyjson_arr_size(values ? values : ulps));
+    bool good = count <= MAX_LISTED && (values ? count == length : length <= MAX_RULED);
+    yyjson_arr_iter iter = yyjson_arr_iter_with(values);
+    while (Json each = yyjson_arr_iter_next(&iter)) good = good && listed_position(each, number);
+    if (!record.need(good, "values", "as many numbers as there are positions, or a rule", error))
+        return false;
+    good = !ulps || (count >= 1 && count <= length && !values);
+    iter = yyjson_arr_iter_with(good ? ulps : nullptr);
     int64_t moves = 0;
     while (Json each = yyjson_arr_iter_next(&iter))
         good = good && is_whole(each, -ULPS_LIMIT, ULPS_LIMIT, moves);
     return record.need(good, "ulps", "whole numbers of a rule", error);
 }
 
-bool check_coordinates(const Variable& variable, fhash_error& error) {
-    Record all;
-    if (!variable.header.find("coordinates")) return true;
-    if (!variable.header.record("coordinates", all, error)) return false;
+// Finds the objects of the axes of variable `number`, its own or those of another variable.
+bool read_coordinates(std::vector<Variable>& all, size_t number, fhash_error& error) {
+    Record own, other;
+    if (!all[number].header.find("coordinates")) return true;
+    if (!all[number].header.record("coordinates", own, error)) return false;
     for (int axis = 0; axis < 4; axis++) {
         Record record;
-        if (!all.find(AXES[axis])) continue;
-        if (!all.record(AXES[axis], record, error) ||
-            !all.need(variable.shape[axis] <= MAX_RULED, AXES[axis], "an array", error) ||
-            !check_positions(record, variable.shape[axis], error))
+        int64_t from = 0;
+        if (!own.find(AXES[axis])) continue;
+        if (is_whole(own.find(AXES[axis]), 0, int64_t(all.size()) - 1, from)) {
+            const Json theirs = all[size_t(from)].header.find("coordinates");
+            other = {theirs, own.prefix};
+            if (!own.need(yyjson_is_obj(yyjson_obj_get(theirs, AXES[axis])), AXES[axis],
+                          "the number of a variable that has it", error))
+                return false;
+        } else other = own;
+        if (!other.record(AXES[axis], record, error) ||
+            !check_positions(record, all[number].shape[axis], error))
             return false;
+        all[number].coordinates[axis] = record.values;
     }
     return true;
 }
@@ -238,17 +223,12 @@ bool check_coordinates(const Variable& variable, fhash_error& error) {
 bool check_arrays(const Variable& variable, fhash_error& error) {
     const auto& level = variable.levels[0];
     const int64_t* const shape = variable.shape;
-    const Json coordinates = variable.header.find("coordinates");
-    for (int axis = 0; axis < 4; axis++)
-        if (!check_array(variable, COORDINATES[axis], {shape[axis]}, {FHASH_FLOAT64},
-                         !yyjson_obj_get(coordinates, AXES[axis]), error))
-            return false;
     // The product of three lengths up to 2^40 is beyond int64; an array's shape is not.
     double vertices = double(shape[1]) * double(shape[2]) * double(shape[3]);
     const int64_t bytes = vertices < 1e18 ? (shape[1] * shape[2] * shape[3] + 7) / 8 : 0;
     if (!check_array(variable, "key_frames", {level[0]}, {FHASH_INT64}, level[0] < shape[0],
                      error) ||
-        !check_array(variable, "missing/bits", {shape[0], bytes}, {FHASH_UINT8}, false, error))
+        !check_array(variable, "missing", {shape[0], bytes}, {FHASH_UINT8}, false, error))
         return false;
     const std::vector<int64_t> lengths(level.begin(), level.end());
     if (variable.compact && !variable.plain) {
@@ -257,21 +237,14 @@ bool check_arrays(const Variable& variable, fhash_error& error) {
     } else {
         const int64_t features = variable.compact ? 1 : variable.features;
         const std::vector<int64_t> bits = {features, level[0], occupancy_bytes(variable)};
-        const bool masked = !variable.compact && variable.find("occupancy/mask");
-        if (!(masked ? check_array(variable, "occupancy/mask", lengths, {FHASH_UINT8}, true, error)
-                     : check_array(variable, "occupancy/bits", bits, {FHASH_UINT8}, true, error)) ||
+        if (!check_array(variable, "occupancy", bits, {FHASH_UINT8}, true, error) ||
             !(variable.compact ? check_plain(variable, error) : check_network(variable, error)))
             return false;
-        if (masked && (variable.find("occupancy/bits") || features > 8 ||
-                       variable.model.find("sparse")))
-            return fail(error, FHASH_ERROR_DAMAGED,
-                        "array occupancy/mask is there beside occupancy/bits, in a file of sparse "
-                        "tables, or of more than 8 features");
     }
     const bool transform = has_feature(variable.top, "transform");
     for (const auto& each : variable.arrays) {
         const bool beside = each.first.rfind("auxiliary/", 0) == 0 && !variable.plain;
-        if (!transform && (each.second->sharded || (each.second->tiles && !beside)))
+        if (!transform && each.second->tiles() && !beside)
             return fail(error, FHASH_ERROR_DAMAGED, "array %s has codecs of the feature transform",
                         each.first.c_str());
     }
@@ -285,99 +258,50 @@ bool read_header(Variable& variable, fhash_error& error) {
                               "features", "a list of texts", error))
         return false;
     return read_values(variable, error) && read_box(variable, error) &&
-           read_model(variable, error) && check_coordinates(variable, error);
+           read_model(variable, error);
 }
 
-// Reads the places of the arrays of variables that lie with them.
-struct Places {
-    const Hierarchy& hierarchy;
-    std::vector<Variable>& variables;
-    std::map<std::string, size_t> tables;  // numbers of variables by their table at the root
-    std::vector<std::map<std::string, const Array*>> own;
-
-    bool read_names(size_t number, fhash_error& error) {
-        const Record& header = variables[number].header;
-        std::string table;
-        if (header.find("array") &&
-            (!header.text("array", table, error) ||
-             !header.need(is_node(table) && tables.emplace(table, number).second, "array",
-                          "a name that no other has", error)))
-            return false;
-        const Json list = header.find("dimensions");
-        bool good = yyjson_is_arr(list) && yyjson_arr_size(list) == 4;
-        std::string* const names = variables[number].dimensions;
-        for (size_t a = 0; good && a < 4; a++) {
-            const Json name = yyjson_arr_get(list, a);
-            good = yyjson_is_str(name);
-            if (good) names[a] = yyjson_get_str(name);
-            good = good && is_node(names[a]) && std::count(names, names + a, names[a]) == 0;
-        }
-        return header.need(good, "dimensions", "four different names", error);
+// The arrays of the variables by their names: of one their paths, of several those below v0, v1 ...
+void place_own(const Hierarchy& hierarchy, std::vector<std::map<std::string, const Array*>>& own) {
+    for (const auto& each : hierarchy.arrays) {
+        const std::string& path = each.first;
+        const size_t slash = path.find('/');
+        const std::string group = path.substr(0, slash);
+        if (own.size() == 1) own[0][path] = &each.second;
+        if (own.size() == 1 || slash == std::string::npos || group.size() > 10) continue;
+        const size_t number = size_t(std::strtoull(group.c_str() + 1, nullptr, 10));
+        if (number < own.size() && group == "v" + std::to_string(number))
+            own[number][path.substr(slash + 1)] = &each.second;
     }
+}
 
-    bool place_own(fhash_error& error) {
-        own.resize(variables.size());
-        for (const auto& each : hierarchy.arrays) {
-            const auto at = tables.find(each.first);
-            if (at != tables.end()) {
-                if (!own[at->second].emplace("tables/level_1", &each.second).second)
-                    return fail(error, FHASH_ERROR_DAMAGED, "array %s is there twice",
-                                each.first.c_str());
-            } else if (each.first.rfind("parts/", 0) == 0) {
-                size_t number = 0;
-                std::string name;
-                if (!split_part(each.first, variables.size(), number, name) ||
-                    name.rfind("coords/", 0) == 0 ||
-                    !own[number].emplace(name, &each.second).second)
-                    return fail(error, FHASH_ERROR_DAMAGED, "array %s belongs to no variable",
-                                each.first.c_str());
-            }
-        }
-        return true;
+// Gives a variable the arrays that lie with others.
+bool add_shared(Variable& variable, const std::vector<std::map<std::string, const Array*>>& own,
+                fhash_error& error) {
+    Record shares;
+    if (!variable.header.find("shares")) return true;
+    if (!variable.header.record("shares", shares, error)) return false;
+    yyjson_obj_iter iter = yyjson_obj_iter_with(shares.values);
+    while (Json key = yyjson_obj_iter_next(&iter)) {
+        const std::string name = yyjson_get_str(key);
+        const Json place = yyjson_obj_iter_get_val(key);
+        const bool pair = yyjson_is_arr(place) && yyjson_arr_size(place) == 2;
+        std::string other = name;
+        if (pair && yyjson_is_str(yyjson_arr_get(place, 1)))
+            other = yyjson_get_str(yyjson_arr_get(place, 1));
+        const bool beside = name.rfind("auxiliary/", 0) == 0 && other.rfind("auxiliary/", 0) == 0;
+        int64_t from = 0;
+        if (!is_whole(pair ? yyjson_arr_get(place, 0) : place, 0, int64_t(own.size()) - 1, from) ||
+            !(beside || (name == other && !pair)))
+            return shares.refuse(name.c_str(), "the number of a variable", error);
+        const auto found = own[size_t(from)].find(other);
+        if (found == own[size_t(from)].end() ||
+            !variable.arrays.emplace(name, found->second).second)
+            return fail(error, FHASH_ERROR_DAMAGED, "shared array %s is missing, or is there",
+                        shown(name.c_str()).c_str());
     }
-
-    bool share(size_t number, fhash_error& error) {
-        Variable& variable = variables[number];
-        variable.arrays = own[number];
-        Record shares;
-        if (!variable.header.find("shares")) return true;
-        if (!variable.header.record("shares", shares, error)) return false;
-        yyjson_obj_iter iter = yyjson_obj_iter_with(shares.values);
-        while (Json key = yyjson_obj_iter_next(&iter)) {
-            const std::string name = yyjson_get_str(key);
-            const Json place = yyjson_obj_iter_get_val(key);
-            const bool pair = yyjson_is_arr(place) && yyjson_arr_size(place) == 2;
-            std::string other = name;
-            if (pair && yyjson_is_str(yyjson_arr_get(place, 1)))
-                other = yyjson_get_str(yyjson_arr_get(place, 1));
-            const bool beside =
-                name.rfind("auxiliary/", 0) == 0 && other.rfind("auxiliary/", 0) == 0;
-            int64_t from = 0;
-            if (!is_whole(pair ? yyjson_arr_get(place, 0) : place, 0,
-                          int64_t(variables.size()) - 1, from) ||
-                !(beside || (name == other && !pair && name.rfind("coords/", 0) != 0)))
-                return shares.refuse(name.c_str(), "the number of a variable", error);
-            const auto found = own[size_t(from)].find(other);
-            if (found == own[size_t(from)].end() ||
-                !variable.arrays.emplace(name, found->second).second)
-                return fail(error, FHASH_ERROR_DAMAGED, "shared array %s is missing, or is there",
-                            shown(name.c_str()).c_str());
-        }
-        return true;
-    }
-
-    bool add_coordinates(Variable& variable, fhash_error& error) {
-        for (int axis = 0; axis < 4; axis++) {
-            const std::string& node = variable.dimensions[axis];
-            if (tables.count(node))
-                return fail(error, FHASH_ERROR_DAMAGED,
-                            "header key dimensions has a name that a variable has");
-            if (const Array* const array = hierarchy.find(node))
-                variable.arrays[COORDINATES[axis]] = array;
-        }
-        return true;
-    }
-};
+    return true;
+}
 
 // Whole numbers in the order of floats, and back.
 template <class Float, class Whole> Float moved(Float value, int64_t by) {
@@ -468,7 +392,7 @@ bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fh
     const size_t count = yyjson_is_arr(list) ? yyjson_arr_size(list) : 0;
     if (!top.need(count > 0, "variables", "a list of at least one object", error)) return false;
     found.resize(count);
-    Places places{hierarchy, found, {}, {}};
+    std::vector<std::map<std::string, const Array*>> own(count);
     std::set<std::string> names;
     yyjson_arr_iter iter = yyjson_arr_iter_with(list);
     for (size_t i = 0; i < count; i++) {
@@ -484,20 +408,20 @@ bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fh
             !top.need(names.insert(variable.name).second, "variables",
                       "of names that stand once", error))
             return false;
-        if (!read_header(variable, error) || !places.read_names(i, error))
-            return in_variable(found, i, error);
+        if (!read_header(variable, error)) return in_variable(found, i, error);
     }
-    if (!places.place_own(error)) return false;
-    for (size_t i = 0; i < count; i++)
-        if (!places.share(i, error) || !places.add_coordinates(found[i], error) ||
+    place_own(hierarchy, own);
+    for (size_t i = 0; i < count; i++) {
+        found[i].arrays = own[i];
+        if (!read_coordinates(found, i, error) || !add_shared(found[i], own, error) ||
             !check_arrays(found[i], error))
             return in_variable(found, i, error);
+    }
     return true;
 }
 
-bool header_positions(const Variable& variable, int axis, double* positions, fhash_error& error) {
-    const Json rule = yyjson_obj_get(variable.header.find("coordinates"), AXES[axis]);
-    if (!rule) return fail(error, FHASH_ERROR_DAMAGED, "positions are missing");
+void find_positions(const Variable& variable, int axis, double* positions) {
+    const Json rule = variable.coordinates[axis];
     const int64_t length = variable.shape[axis];
     const Json values = yyjson_obj_get(rule, "values"), ulps = yyjson_obj_get(rule, "ulps");
     const Json start = yyjson_obj_get(rule, "start"), step = yyjson_obj_get(rule, "step");
@@ -507,7 +431,7 @@ bool header_positions(const Variable& variable, int axis, double* positions, fha
     for (int64_t i = 0; i < length; i++) {
         double value = 0;
         if (values) {
-            value = yyjson_get_num(yyjson_arr_iter_next(&iter));
+            listed_position(yyjson_arr_iter_next(&iter), value);
         } else {
             value = double(i) * (step ? yyjson_get_num(step) : 1);
             value += start ? yyjson_get_num(start) : 0;
@@ -517,7 +441,6 @@ bool header_positions(const Variable& variable, int axis, double* positions, fha
         positions[i] = narrow ? double(moved<float, int32_t>(float(value), by))
                               : moved<double, int64_t>(value, by);
     }
-    return true;
 }
 
 int64_t occupancy_bytes(const Variable& variable) {

@@ -79,7 +79,7 @@ struct KeyTimes {
             return false;
         }
         steps.resize(count);
-        if (!read_positions(file, variable, 0, steps.data(), error)) return false;
+        find_positions(variable, 0, steps.data());
         order_times(steps);
         for (const int64_t frame : keys) at.push_back(steps[size_t(frame)]);
         return true;
@@ -320,15 +320,8 @@ bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice
 
 bool add_occupancy(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                    Buffer& mask, fhash_error& error) {
-    if (const Array* const array = variable.find("occupancy/mask")) {
-        Frame frame;
-        if (!read_table(file, *array, key, lattice, frame, error)) return false;
-        const uint8_t all = uint8_t((1u << variable.features) - 1);
-        for (size_t i = 0; i < mask.size(); i++) mask[i] |= (frame.values[i] & all) != 0;
-        return true;
-    }
-    const Array* const array = variable.find("occupancy/bits");
-    if (!array) return fail(error, FHASH_ERROR_DAMAGED, "array occupancy/bits is missing");
+    const Array* const array = variable.find("occupancy");
+    if (!array) return fail(error, FHASH_ERROR_DAMAGED, "array occupancy is missing");
     return add_bits(file, variable, *array, key, lattice, mask, error);
 }
 

@@ -11,7 +11,7 @@ namespace {
 constexpr int64_t MAX_AXIS = int64_t(1) << 62;
 constexpr uint64_t MAX_CHUNK_BYTES = 1 << 30;     // of a decoded inner chunk
 constexpr uint64_t MAX_TILE = 1 << 27;            // vertices
-constexpr uint64_t MAX_SHARD_CHUNKS = 1 << 20;
+constexpr uint64_t MAX_TOGETHER = 1 << 20;        // tiles of a member
 constexpr uint64_t MAX_DOCUMENT = 16 << 20;
 constexpr uint64_t DOCUMENT_GAP = 16 << 10;   // bytes between documents that are read as well
 constexpr uint64_t DOCUMENT_READ = 16 << 20;  // bytes of a read of several documents
@@ -85,7 +85,7 @@ bool from_base64(const char* text, size_t size, std::string& bytes) {
     return true;
 }
 
-// The axes in the configuration of tiles: for each axis of the array that of the tile.
+// The axes of tiles: for each axis of the array that of the tile.
 bool read_places(Json list, Array& array, fhash_error& error) {
     bool taken[4] = {};
     bool good = yyjson_is_arr(list) && yyjson_arr_size(list) == size_t(array.axes);
@@ -101,28 +101,7 @@ bool read_places(Json list, Array& array, fhash_error& error) {
         if (place < 4) taken[place] = true;
         array.usual = array.usual && place == a + 4 - array.axes;
     }
-    return good || damaged(error, "codec fhash.transform: its axes are not allowed");
-}
-
-bool read_tiles(Json codecs, Array& array, fhash_error& error) {
-    array.tiles = true;
-    if (!product_within(array.inner, array.axes, MAX_TILE))
-        return damaged(error, "tiles of more than 2^27 vertices");
-    if (yyjson_arr_size(codecs) != 1)
-        return unsupported(error, "no codec may follow fhash.transform");
-    const Json configuration = yyjson_obj_get(yyjson_arr_get_first(codecs), "configuration");
-    const Json axes = yyjson_obj_get(configuration, "axes");
-    const Json settings = yyjson_obj_get(configuration, "settings");
-    if (yyjson_obj_size(configuration) != size_t((axes != nullptr) + (settings != nullptr)))
-        return damaged(error, "codec fhash.transform: its configuration has an unknown key");
-    if (settings && (!yyjson_is_str(settings) ||
-                     !from_base64(yyjson_get_str(settings), yyjson_get_len(settings),
-                                  array.settings) || array.settings.empty()))
-        return damaged(error, "codec fhash.transform: its settings are no base64");
-    if (axes) return read_places(axes, array, error);
-    if (array.axes > 4) return damaged(error, "fhash.transform codes arrays of at most 4 axes");
-    for (int a = 0; a < array.axes; a++) array.places[a] = a + 4 - array.axes;
-    return true;
+    return good || damaged(error, "attribute tiles: axes are not allowed");
 }
 
 bool read_plain(Json codecs, const Array& array, fhash_error& error) {
@@ -136,54 +115,55 @@ bool read_plain(Json codecs, const Array& array, fhash_error& error) {
                 json_is(yyjson_arr_get(codecs, 2), R"({"name":"crc32c"})");
     const bool one = fhash_type_size(array.type) == 1 && json_is(first, R"({"name":"bytes"})");
     good = good && (one || json_is(first, little));
-    return good || unsupported(error, "codecs other than bytes, zstd, crc32c, fhash.transform");
+    return good || unsupported(error, "codecs other than bytes, zstd, crc32c");
 }
 
-// The codecs of inner chunks.
+// The codecs of the chunks of an array that is no table of tiles.
 bool read_codecs(Json codecs, Array& array, fhash_error& error) {
     const size_t size = fhash_type_size(array.type);
     if (!product_within(array.inner, array.axes, MAX_CHUNK_BYTES / size))
         return damaged(error, "chunks of more than 2^30 bytes");
-    yyjson_arr_iter iter = yyjson_arr_iter_with(codecs);
-    while (Json codec = yyjson_arr_iter_next(&iter)) {
-        const Json configuration = yyjson_obj_get(codec, "configuration");
-        if (!yyjson_is_str(yyjson_obj_get(codec, "name")) ||
-            (configuration && !yyjson_is_obj(configuration)))
-            return damaged(error, "codecs are not a list of {name, configuration}");
-    }
-    const Json name = yyjson_obj_get(yyjson_arr_get_first(codecs), "name");
-    return is(name, "fhash.transform") ? read_tiles(codecs, array, error)
-                                       : read_plain(codecs, array, error);
+    return read_plain(codecs, array, error);
 }
 
-bool read_sharding(Json codecs, Array& array, fhash_error& error) {
-    const Json codec = yyjson_arr_get_first(codecs);
-    if (!is(yyjson_obj_get(codec, "name"), "sharding_indexed"))
-        return read_codecs(codecs, array, error);
-    const Json settings = yyjson_obj_get(codec, "configuration");
-    const Json location = yyjson_obj_get(settings, "index_location");
-    const Json chunk = yyjson_obj_get(settings, "chunk_shape");
-    const Json inner = yyjson_obj_get(settings, "codecs");
-    const Json index = yyjson_obj_get(settings, "index_codecs");
-    const size_t known = size_t(!!chunk + !!inner + !!index + !!location);
-    if (yyjson_arr_size(codecs) != 1 || !settings || yyjson_obj_size(settings) != known ||
-        (location && !is(location, "end")) ||
-        !json_is(index, R"([{"name":"bytes","configuration":{"endian":"little"}},)"
-                        R"({"name":"crc32c"}])"))
-        return unsupported(error, "sharding_indexed with settings that are not allowed");
-    if (!yyjson_is_arr(inner)) return damaged(error, "sharding_indexed: codecs is not a list");
-    int axes = 0;
-    if (!read_lengths(chunk, array.inner, axes, "chunk_shape", error)) return false;
-    Lengths counts = {};
-    bool good = axes == array.axes;
-    for (int a = 0; good && a < axes; a++) {
-        good = array.chunk[a] % array.inner[a] == 0;
-        counts[a] = array.per_chunk(a);
+// What `tiles` says of them; the array has been read as their index.
+bool read_tiles(Json tiles, Array& array, fhash_error& error) {
+    if (!yyjson_is_obj(tiles) || !is(yyjson_obj_get(tiles, "codec"), "fhash.transform"))
+        return unsupported(error, "attribute tiles: of another codec than fhash.transform");
+    if (!check_keys(tiles, {"shape", "data_type", "tile", "codec", "settings", "axes", "package"},
+                    error))
+        return fail_in(error, "attribute tiles");
+    if (array.type != FHASH_UINT32)
+        return damaged(error, "the index of tiles is no array of uint32");
+    array.index = std::make_shared<Array>(array);
+    const Array& index = *array.index;
+    const Json type = yyjson_obj_get(tiles, "data_type"), axes = yyjson_obj_get(tiles, "axes"),
+               settings = yyjson_obj_get(tiles, "settings");
+    array.type = yyjson_is_str(type) ? type_of_name(yyjson_get_str(type)) : 0;
+    if (!array.type) return unsupported(error, "attribute tiles: data_type is not allowed");
+    int more[2] = {};
+    if (!read_lengths(yyjson_obj_get(tiles, "shape"), array.shape, more[0], "tiles.shape", error) ||
+        !read_lengths(yyjson_obj_get(tiles, "tile"), array.inner, more[1], "tiles.tile", error))
+        return false;
+    bool good = more[0] == array.axes && more[1] == array.axes;
+    for (int a = 0; good && a < array.axes; a++) {
+        good = array.inner[a] <= MAX_AXIS / index.chunk[a] &&
+               array.count(array.inner, a) == index.shape[a];
+        array.chunk[a] = good ? array.inner[a] * index.chunk[a] : 1;
+        array.together = array.together || index.chunk[a] > 1;
     }
-    if (!good || !product_within(counts, axes, MAX_SHARD_CHUNKS))
-        return damaged(error, "sharding_indexed: shards do not fit to their inner chunks");
-    array.sharded = true;
-    return read_codecs(inner, array, error);
+    if (!good || !product_within(index.chunk, array.axes, MAX_TOGETHER))
+        return damaged(error, "attribute tiles: they do not fit to their index");
+    if (!product_within(array.inner, array.axes, MAX_TILE))
+        return damaged(error, "tiles of more than 2^27 vertices");
+    if (settings && (!yyjson_is_str(settings) ||
+                     !from_base64(yyjson_get_str(settings), yyjson_get_len(settings),
+                                  array.settings) || array.settings.empty()))
+        return damaged(error, "attribute tiles: settings are no base64");
+    if (axes) return read_places(axes, array, error);
+    if (array.axes > 4) return damaged(error, "fhash.transform codes arrays of at most 4 axes");
+    for (int a = 0; a < array.axes; a++) array.places[a] = a + 4 - array.axes;
+    return true;
 }
 
 bool check_names(Json names, int axes, fhash_error& error) {
@@ -232,18 +212,22 @@ bool read_array(Json values, Array& array, fhash_error& error) {
     if (!yyjson_is_arr(codecs)) return damaged(error, "codecs is not a list");
     array.attributes = yyjson_obj_get(values, "attributes");
     array.inner = array.chunk;
-    return read_sharding(codecs, array, error);
+    const Json tiles = yyjson_obj_get(array.attributes, "tiles");
+    return read_codecs(codecs, array, error) && (!tiles || read_tiles(tiles, array, error));
 }
 
-// Splits the name of a chunk's member, "path/c/0/1", into the path and the index; false for others.
-bool split_chunk(const std::string& name, std::string& path, std::vector<int64_t>& index) {
+// Splits the name of a chunk's member, "path/c/0/1", or of that of tiles, "path/t/0", into the path
+// and the index; false for others.
+bool split_chunk(const std::string& name, std::string& path, std::vector<int64_t>& index,
+                 bool& tiles) {
     size_t stop = name.size();
     index.clear();
     while (true) {
         const size_t slash = name.rfind('/', stop - 1);
         if (slash == std::string::npos || slash == 0) return false;
         const std::string part = name.substr(slash + 1, stop - slash - 1);
-        if (part == "c" && !index.empty()) {
+        tiles = part == "t" && index.size() == 1;
+        if (tiles || (part == "c" && !index.empty())) {
             path = name.substr(0, slash);
             std::reverse(index.begin(), index.end());
             return true;
@@ -258,7 +242,7 @@ bool split_chunk(const std::string& name, std::string& path, std::vector<int64_t
 
 constexpr uint32_t NO_MEMBER = 0xFFFFFFFF;
 
-// Gives an array room for the members of its chunks, of which the file has `count`.
+// Gives an array room for its members, of which the file has `count`.
 bool make_room(Array& array, uint64_t count, fhash_error& error) {
     uint64_t chunks = 1;
     for (int a = 0; a < array.axes && chunks; a++) {
@@ -273,72 +257,52 @@ bool make_room(Array& array, uint64_t count, fhash_error& error) {
     return true;
 }
 
-bool place_member(Array& array, const std::vector<int64_t>& index, uint32_t number) {
-    if (index.size() != size_t(array.axes)) return false;
-    uint64_t place = 0;
-    for (int a = 0; a < array.axes; a++) {
-        const int64_t along = array.count(array.chunk, a);
-        if (index[size_t(a)] >= along) return false;
-        place = place * uint64_t(along) + uint64_t(index[size_t(a)]);
+bool place_member(Array& array, const std::vector<int64_t>& index, bool linear, uint32_t number) {
+    uint64_t place = uint64_t(index[0]);
+    if (!linear) {
+        if (index.size() != size_t(array.axes)) return false;
+        place = 0;
+        for (int a = 0; a < array.axes; a++) {
+            const int64_t along = array.count(array.chunk, a);
+            if (index[size_t(a)] >= along) return false;
+            place = place * uint64_t(along) + uint64_t(index[size_t(a)]);
+        }
     }
+    if (place >= array.members.size()) return false;
     array.members[size_t(place)] = number;  // names are unique, so no place is taken twice
     return true;
 }
 
 bool place_chunks(const Directory& directory, Hierarchy& found, fhash_error& error) {
-    std::map<std::string, uint64_t> counts;
+    std::map<const Array*, uint64_t> counts;
     std::string path;
     std::vector<int64_t> index;
-    const auto is_chunk = [&](const Member& member) {
-        return split_chunk(member.name, path, index) && found.arrays.count(path);
+    bool linear = false;
+    // The array, or the index of one of tiles, of which a member is a chunk; null for none.
+    const auto array_of = [&](const Member& member) -> Array* {
+        if (!split_chunk(member.name, path, index, linear)) return nullptr;
+        const auto at = found.arrays.find(path);
+        if (at == found.arrays.end() || (linear && !at->second.tiles())) return nullptr;
+        if (linear || !at->second.tiles()) return &at->second;
+        return at->second.together ? at->second.index.get() : nullptr;
     };
     for (const Member& member : directory.members)
-        if (is_chunk(member)) counts[path]++;
-    for (auto& each : found.arrays)
-        if (!make_room(each.second, counts[each.first], error)) return false;
+        if (const Array* const array = array_of(member)) counts[array]++;
+    for (auto& each : found.arrays) {
+        Array& array = each.second;
+        if (!make_room(array, counts[&array], error) ||
+            (array.together && !make_room(*array.index, counts[array.index.get()], error)))
+            return false;
+    }
     for (uint32_t number = 0; number < directory.members.size(); number++) {
         const Member& member = directory.members[number];
         if (is_document(member.name)) continue;
-        if (!is_chunk(member) || !place_member(found.arrays[path], index, number))
+        Array* const array = array_of(member);
+        if (!array || !place_member(*array, index, linear, number))
             return fail(error, FHASH_ERROR_DAMAGED, "member %s belongs to no array",
                         member.name.c_str());
     }
     return true;
-}
-
-// The end of a JSON value, of text that was parsed before.
-const char* skip_value(const char* at) {
-    int depth = 0;
-    do {
-        if (*at == '"') {
-            for (at++; *at != '"'; at++) at += *at == '\\';
-        } else if (*at == '{' || *at == '[') {
-            depth++;
-        } else if (*at == '}' || *at == ']') {
-            depth--;
-        }
-        at++;
-    } while (depth > 0 || (at[-1] != '"' && at[-1] != '}' && at[-1] != ']' &&
-                           *at != ',' && *at != '}' && *at != ']'));
-    return at;
-}
-
-// The texts of the values of an object by their keys, where nothing stands between tokens.
-std::map<std::string, std::string> value_texts(const std::string& object) {
-    std::map<std::string, std::string> found;
-    if (object.size() < 3 || object[1] != '"') return found;
-    const char* at = object.c_str() + 1;
-    while (*at == '"') {
-        const char* const key = at + 1;
-        at = skip_value(at);
-        const std::string name(key, at - 1);
-        if (*at != ':') break;
-        const char* const value = at + 1;
-        at = skip_value(value);
-        found[name].assign(value, at);
-        if (*at == ',') at++;
-    }
-    return found;
 }
 
 // Reads the documents of all nodes, those that lie together at once.
@@ -391,38 +355,12 @@ struct Documents {
         return true;
     }
 
-    // Takes documents from the root's copies of them, where these are the same byte by byte: the
-    // directory has their checksums. They need not be read.
-    bool take_copies(fhash_error& error) {
-        const auto found =
-            value_texts(value_texts(value_texts(texts[""])["consolidated_metadata"])["metadata"]);
-        const Json copies = yyjson_obj_get(
-            yyjson_obj_get(nodes.at(""), "consolidated_metadata"), "metadata");
-        yyjson_obj_iter iter = yyjson_obj_iter_with(copies);
-        while (Json key = yyjson_obj_iter_next(&iter)) {
-            const std::string path = yyjson_get_str(key);
-            const Member* const member = directory.find(path + "/zarr.json");
-            const auto text = found.find(path);
-            if (!member || text == found.end()) continue;
-            const uint64_t size =
-                member->full_size < 0 ? member->size : uint64_t(member->full_size);
-            const uint8_t* const bytes = reinterpret_cast<const uint8_t*>(text->second.data());
-            if (size != text->second.size() || crc_32(bytes, size_t(size)) != member->crc) continue;
-            texts[path] = text->second;
-            if (!add(*member, yyjson_obj_iter_get_val(key), error)) return false;
-        }
-        return true;
-    }
-
     bool read_root(fhash_error& error) {
         const Member* const member = directory.find("zarr.json");
         if (!member) return damaged(error, "member zarr.json is missing");
         Buffer bytes;
-        if (!source.read(member->offset, member->end() - member->offset, bytes, error) ||
-            !parse(*member, bytes.data(), error))
-            return false;
-        return !yyjson_is_obj(yyjson_obj_get(nodes.at(""), "consolidated_metadata")) ||
-               take_copies(error);
+        return source.read(member->offset, member->end() - member->offset, bytes, error) &&
+               parse(*member, bytes.data(), error);
     }
 
     bool read(fhash_error& error) {
@@ -450,24 +388,6 @@ struct Documents {
                            [&](const auto& span) { return read_span(span, error); });
     }
 };
-
-// Refuses a root that repeats other documents than the file has.
-bool check_consolidated(const std::map<std::string, Json>& nodes, fhash_error& error) {
-    const Json repeated = yyjson_obj_get(nodes.at(""), "consolidated_metadata");
-    if (!repeated || yyjson_is_null(repeated)) return true;
-    const Json metadata = yyjson_obj_get(repeated, "metadata");
-    bool good = yyjson_obj_size(repeated) == 3 &&
-                is(yyjson_obj_get(repeated, "kind"), "inline") &&
-                yyjson_is_false(yyjson_obj_get(repeated, "must_understand")) &&
-                yyjson_is_obj(metadata) && yyjson_obj_size(metadata) == nodes.size() - 1;
-    yyjson_obj_iter iter = yyjson_obj_iter_with(good ? metadata : nullptr);
-    while (Json key = yyjson_obj_iter_next(&iter)) {
-        const auto own = nodes.find(yyjson_get_str(key));
-        good = good && own != nodes.end() && !own->first.empty() &&
-               yyjson_equals(own->second, yyjson_obj_iter_get_val(key));
-    }
-    return good || damaged(error, "member zarr.json: consolidated_metadata has other documents");
-}
 
 }  // namespace
 
@@ -510,7 +430,6 @@ bool read_hierarchy(const Source& source, const Directory& directory, Hierarchy&
             return fail(error, FHASH_ERROR_DAMAGED, "member %s/zarr.json lies in no group",
                         node.first.c_str());
     }
-    if (!check_consolidated(documents.nodes, error)) return false;
     for (const auto& node : documents.nodes) {
         if (is_group(node.first)) continue;
         Array& array = found.arrays[node.first];
