@@ -98,7 +98,7 @@ class FileInfo(TypedDict):
     variable: Annotated[Variable, "what the values are"]
     source: NotRequired[Annotated[dict[str, Any], "what belongs to the variable"]]
     domain: Annotated[Domain, "the lattice"]
-    coordinates: Annotated[dict[str, Any], "coordinates that need no array"]
+    coordinates: Annotated[dict[str, Any], "positions along the axes, as rules or values"]
     value_range: Annotated[list[float], "smallest and largest value"]
     background: Annotated[float, "value outside the coreset on request"]
     features: Annotated[list[str], "as `--feature` names them"]
@@ -110,6 +110,7 @@ class FileInfo(TypedDict):
         dict[str, Any], "the model, see FORMAT.md, The model; `between` is always there"
     ]
     config: Annotated[dict[str, Any], "every setting that the file was made with"]
+    mlp: Annotated[dict[str, Any] | None, "the MLP behind the table, if there is one there"]
     training: Annotated[dict[str, Any], "seconds, epochs, device and more"]
     history: Annotated[list[HistoryPoint], "course of the training"]
     quality: Annotated[FileQuality, "figures of the quality"]

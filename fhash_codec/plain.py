@@ -175,11 +175,11 @@ class _Export:
         )
         for table in tables[1:]:
             self._write_table(table)
-        self._write_head(head)
         self._write_occupancy(keys)
         self._write_corrections(array, head)
         return {
             **self._header,
+            "mlp": None if head is None else head.to_json(),
             "required_features": [PLAIN_FEATURE],
             "model": {
                 **self._header["model"],
@@ -187,7 +187,6 @@ class _Export:
                 "tables": tables[0].dtype.name,
                 "values": array.dtype.name,
                 "tile": list(array.chunk_shape),
-                "head": _described(head),
             },
         }
 
@@ -291,19 +290,6 @@ class _Export:
                 self._total += prod(array.grid)
                 self._copy(name, array)
 
-    def _write_head(self, head: NeighbourHead | None) -> None:
-        """Write weights and biases as the numbers that they are; `scale` is their unit."""
-        if head is None:
-            return
-        layers = zip(head.layers, self._volume.mlp.layers, strict=True)
-        for number, (layer, (weights, biases)) in enumerate(layers, start=1):
-            for name, values, scale in (
-                ("weight", weights, layer.weight_scale),
-                ("bias", biases, layer.bias_scale),
-            ):
-                attributes = {"scale": scale}
-                self._writer.add_whole(f"mlp/{name}_{number}", values, attributes=attributes)
-
     def _write_occupancy(self, keys: int) -> None:
         """Write the bits of every key frame, of the published network those of each feature."""
         model, box = self._volume._model, self._volume.box.shape
@@ -350,18 +336,6 @@ def _node(name: str, axis: str) -> str:
     taken = {BITS_ARRAY, MISSING_ARRAY, STEPS, "key_frames", "corrections", "tables", "mlp"}
     allowed = re.fullmatch(r"[A-Za-z0-9-][A-Za-z0-9_-]{0,80}", name) and name not in taken
     return name if allowed else f"axis_{axis}"
-
-
-def _described(head: NeighbourHead | None) -> dict[str, Any] | None:
-    """The object of a head in the header: all of it that is no array."""
-    if head is None:
-        return None
-    return {
-        "widths": list(head.hidden),
-        "sigma": head.sigma,
-        "low": head.low,
-        "high": head.high,
-    }
 
 
 def _chunk_shape(table: Table) -> Index:

@@ -115,7 +115,6 @@ def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
         "embedding_size": 1,
         "tables": blocks.source_dtype.name,
         "parameters": table.outcome.nonzero + weights,
-        "head": None if head is None else {"hidden": list(head.hidden)},
         "gains": [
             [gain[name] for name in (GAIN if config.timings else GAIN[:-1]) if name in gain]
             for gain in table.plan.gains

@@ -16,12 +16,12 @@ from fhash_codec.features.occupancy import read_occupancy
 from fhash_codec.header import read_missing, rule_between
 from fhash_codec.measure.value_range import decoded_type
 from fhash_formats.container import Container, StoredArray
-from fhash_formats.container.header import CUBIC, MISSING_ARRAY, PLAIN_FEATURE, TABLE
+from fhash_formats.container.header import CUBIC, MISSING_ARRAY, MLP, PLAIN_FEATURE, TABLE
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import library, pointer
 from fhash_formats.support.threads import chunk_region, common_part
 from fhash_formats.support.values import Double
-from fhash_formats.transform.head import Layer, NeighbourHead
+from fhash_formats.transform.head import NeighbourHead
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import cast
 
@@ -134,10 +134,6 @@ def _nearest(first: int, stop: int, stride: int, start: int, size: int) -> npt.N
 
 CACHED_TILES = 8
 """Corrected tiles that an open file keeps."""
-MAX_FRACTION = 1e-3
-"""Largest distance of a weight from a whole multiple of its unit, in units: float32 stores up to
-127 of them with an error of 1e-5."""
-
 Region = tuple[slice, ...]
 
 
@@ -170,47 +166,18 @@ def corrected(base: npt.NDArray[Any], corrections: npt.NDArray[Any]) -> npt.NDAr
     return values
 
 
-def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> NeighbourHead | None:
-    """Return the head of a plain file. Raises DamagedFileError where its arrays do not fit it."""
-    described = model["head"]
-    if described is None:
-        return None
-    layers = []
-    try:
-        for number in range(1, len(described["widths"]) + 2):
-            weights, biases = (
-                _integers(arrays[f"mlp/{kind}_{number}"]) for kind in ("weight", "bias")
-            )
-            layers.append(Layer.of(weights, biases))
-        with np.errstate(over="ignore"):
-            return NeighbourHead(
-                layers=tuple(layers),
-                sigma=described["sigma"],
-                low=described["low"],
-                high=described["high"],
-            )
-    except (InputError, OverflowError) as error:
-        raise DamagedFileError(f"the head of a plain file is damaged: {error}") from error
-
-
-def _integers(array: StoredArray) -> tuple[npt.NDArray[np.int8], float]:
-    """The whole numbers of an array of weights or biases, and their unit."""
-    scale = float(array.attributes["scale"])
-    with np.errstate(over="ignore", invalid="ignore"):
-        numbers = array.read().astype(np.float64) / scale
-        whole = np.abs(numbers - np.rint(numbers)) <= MAX_FRACTION
-    if not whole.all() or np.abs(numbers).max() > 127:
-        raise DamagedFileError(f"array {array.name} has numbers that are no multiples of its scale")
-    return np.rint(numbers).astype(np.int8), scale
-
-
 class PlainArray:
     """The values of a plain file, read as those of the coded array of a compact file."""
 
     masked = False
 
-    def __init__(self, model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> None:
-        self._model, self._arrays = model, arrays
+    def __init__(
+        self,
+        model: Mapping[str, Any],
+        mlp: Mapping[str, Any] | None,
+        arrays: Mapping[str, StoredArray],
+    ) -> None:
+        self._model, self._mlp = model, mlp
         self._table = arrays["tables/level_1"]
         self._corrections = arrays.get("corrections")
         self.shape = self._table.shape[:4]
@@ -228,7 +195,7 @@ class PlainArray:
     @cached_property
     def head(self) -> NeighbourHead | None:
         """The head of the file."""
-        return head_of(self._model, self._arrays)
+        return None if self._mlp is None else NeighbourHead.from_json(self._mlp)
 
     def read(self, region: Region) -> npt.NDArray[Any]:
         """Return the values of a region, slices (t, z, y, x) with explicit ends."""
@@ -393,7 +360,7 @@ class CompactModel:
         self._table = self._arrays[TABLE]
         self._plain: PlainArray | None = None
         if PLAIN_FEATURE in container.header["required_features"]:
-            self._plain = PlainArray(container.header["model"], self._arrays)
+            self._plain = PlainArray(container.header["model"], container.header[MLP], self._arrays)
         self._array = self._plain or self._table
         self.chunks = self._array.chunk_shape
         self._cubic = rule_between(container.header)["rule"] == CUBIC

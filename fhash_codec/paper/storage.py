@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from math import prod
 from typing import Any, TypeVar
 
@@ -27,7 +27,6 @@ from fhash_codec.paper.network import (
 )
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE, LAYERS
-from fhash_formats.container.reader import layer_shapes
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.values import Longs, Mask, Single
 
@@ -493,7 +492,10 @@ def load_network(container: Container) -> Network:
 
 def _layers(container: Container) -> tuple[Layer, ...]:
     """Return weight (out, in) and bias (out,) of each layer of the network in a container."""
-    arrays, shapes = container.arrays, layer_shapes(container.header["model"])
+    arrays, model = container.arrays, container.header["model"]
+    inputs = len(model["levels"]) * model["embedding_size"]
+    widths = [inputs, *[model["width"]] * model["hidden_layers"], 1]
+    shapes = [(outputs, inputs) for inputs, outputs in pairwise(widths)]
     if LAYERS not in arrays:
         names = [f"mlp/{{}}_{number}" for number in range(1, len(shapes) + 1)]
         return tuple(

@@ -479,10 +479,9 @@ def _header(
     coder, facts = tiles.metadata.tiles, tiles.facts
     settings = None if coder is None else coder.settings
     source = describe_source(series, scan.value_range, config)
-    weights, head = 0, None
+    weights = 0
     if settings is not None and settings.head is not None:
         weights = settings.head.size
-        head = {"hidden": list(settings.head.hidden)}
     bound = {name: array.quality[name] for name in ("max_error",) if name in array.quality}
     encoder = {**source["encoder"], "command": PACKED}
     return {
@@ -501,7 +500,6 @@ def _header(
             "embedding_size": 1,
             "tables": array.dtype.name,
             "parameters": weights,
-            "head": head,
         },
         "config": {**config.settings(), **bound},
         "quality": {},

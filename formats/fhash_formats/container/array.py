@@ -76,6 +76,30 @@ def transform_codecs(settings: TileSettings) -> list[Codec]:
     return [{"name": TRANSFORM, "configuration": {"settings": settings.to_text()}}]
 
 
+def with_mlp(codec: Codec, mlp: Mapping[str, Any]) -> Codec:
+    """The codec of tiles with the MLP that the header has apart from their settings."""
+    from fhash_formats.transform.head import NeighbourHead
+    from fhash_formats.transform.tile_format import TileSettings
+
+    told = codec["configuration"]
+    settings = TileSettings.from_text(told["settings"], NeighbourHead.from_json(mlp))
+    return {**codec, "configuration": {**told, "settings": settings.to_text()}}
+
+
+def without_mlp(codec: Codec) -> tuple[Codec, Mapping[str, Any] | None]:
+    """The codec of tiles without its MLP, and that as a header has it."""
+    from fhash_formats.transform.tile_format import TileSettings
+
+    told = codec["configuration"]
+    if "settings" not in told:
+        return codec, None
+    settings = TileSettings.from_text(told["settings"])
+    if settings.head is None:
+        return codec, None
+    apart = {**told, "settings": settings.to_text(apart=True)}
+    return {**codec, "configuration": apart}, settings.head.to_json()
+
+
 def chunk_coder(
     codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
 ) -> PlainCoder | TransformCoder:
@@ -151,6 +175,7 @@ class ArrayMetadata:
 
     Attributes:
         together: tiles of a member along each axis; None for an array that has none.
+        mlp: that of the header, which the tiles need.
     """
 
     shape: tuple[int, ...]
@@ -158,13 +183,17 @@ class ArrayMetadata:
     chunk_shape: tuple[int, ...]
     codecs: Sequence[Mapping[str, Any]]
     together: tuple[int, ...] | None = None
+    mlp: Mapping[str, Any] | None = None
     dimension_names: tuple[str | None, ...] | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def coder(self) -> PlainCoder | TransformCoder:
         """The coder of full chunks."""
-        return chunk_coder(self.codecs, self.dtype, self.chunk_shape)
+        codecs = self.codecs
+        if self.mlp is not None:
+            codecs = [with_mlp(codecs[0], self.mlp)]
+        return chunk_coder(codecs, self.dtype, self.chunk_shape)
 
     @property
     def tiles(self) -> TransformCoder | None:
@@ -259,8 +288,10 @@ class ArrayMetadata:
         return values
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> ArrayMetadata:
-        """The metadata in a zarr.json that libfhash has checked."""
+    def from_dict(
+        cls, values: Mapping[str, Any], mlp: Mapping[str, Any] | None = None
+    ) -> ArrayMetadata:
+        """The metadata in a zarr.json that libfhash has checked. mlp: that of the header."""
         attributes = dict(values.get("attributes", {}))
         tiles = attributes.pop(TILES, None)
         chunk = tuple(values["chunk_grid"]["configuration"]["chunk_shape"])
@@ -272,6 +303,7 @@ class ArrayMetadata:
                 chunk_shape=tuple(tiles["tile"]),
                 codecs=[{"name": TRANSFORM, "configuration": told}],
                 together=chunk,
+                mlp=mlp,
                 attributes=attributes,
             )
         names = values.get("dimension_names")

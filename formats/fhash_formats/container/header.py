@@ -14,8 +14,6 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import InputError, UnsupportedFileError
 from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.values import DTYPES, Double
-from fhash_formats.transform.head import MAX_HIDDEN
-from fhash_formats.transform.head import MAX_WIDTH as MAX_HEAD_WIDTH
 
 MAX_LISTED = 1 << 20
 """Numbers of a list of positions, or of differences from a rule."""
@@ -302,6 +300,8 @@ KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE})
 PAPER = "paper"
 COMPACT = "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
+MLP = "mlp"
+"""Key of the header: the MLP of the profile compact."""
 TABLE = "tables/level_1"
 """Name of the array of the finest table."""
 BITS_ARRAY = "occupancy"
@@ -372,6 +372,7 @@ DEFAULTS: dict[str, Any] = {
     "dilation": 1,
     "coreset_fraction": 1.0,
     "coordinates": {},
+    "mlp": None,
     "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
     "history": {},
 }
@@ -587,11 +588,6 @@ def _check_model(
             key,
             f"no float64 for a source of {source}",
         )
-        model.need(
-            model.get("head") is None or isinstance(model.get("head"), Mapping),
-            "head",
-            "an object or null",
-        )
         if model.has("tiling"):
             _check_tiling(model.record("tiling"))
         if model.has(BETWEEN):
@@ -647,16 +643,6 @@ def _check_plain(model: Record) -> None:
     """Check the keys of `model` that only a plain file of the profile compact has."""
     model.choice("tables", PLAIN_TABLE_TYPES)
     model.integers("tile", 4, 1, MAX_LENGTH)
-    if model.get("head") is None:
-        return
-    model.need(model.get("tables") == "float32", "tables", "float32 where there is a head")
-    head = model.record("head")
-    hidden = head.get("widths")
-    count = len(hidden) if isinstance(hidden, list) else 0
-    head.need(1 <= count <= MAX_HIDDEN, "widths", f"1 to {MAX_HIDDEN} widths")
-    head.integers("widths", count, 1, MAX_HEAD_WIDTH)
-    for key in ("sigma", "low", "high"):
-        head.number(key)
 
 
 def brief(header: Mapping[str, Any]) -> dict[str, Any]:

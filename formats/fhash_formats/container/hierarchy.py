@@ -11,6 +11,8 @@ from fhash_formats.errors import DamagedFileError
 
 VARIABLES = "variables"
 """Key of the root's header: the headers of the variables."""
+GROUP_KEY = "group"
+"""Key of the header of one of several variables: the group of its arrays, v and its number."""
 SHARES = "shares"
 """Key of a variable's header: arrays that lie with another variable."""
 SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
@@ -19,9 +21,9 @@ SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
 _OF_ROOT = ("format", "format_version", "required_features")
 
 
-def group_of(number: int) -> str:
-    """The group, and "/", of the arrays of a variable of several. number: from 0."""
-    return f"v{number}/"
+def path_of(header: Mapping[str, Any], name: str) -> str:
+    """The path of an array of a variable in the hierarchy."""
+    return f"{header[GROUP_KEY]}/{name}" if GROUP_KEY in header else name
 
 
 @contextmanager

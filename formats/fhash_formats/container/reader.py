@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
-from itertools import pairwise
 from math import prod
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -17,17 +16,18 @@ import numpy as np
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.header import (
-    COMPACT,
     LOWEST,
     MAX_LEVEL,
+    MLP,
     POSITIONS,
     STEP_BYTES,
     STEP_FIGURES,
     STEPS,
+    TABLE,
     TOGETHER,
     described_coordinate,
 )
-from fhash_formats.container.hierarchy import SHARES, group_of, read_headers, variable_named
+from fhash_formats.container.hierarchy import SHARES, path_of, read_headers, variable_named
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.source_entry import AUXILIARY, check_source
 from fhash_formats.container.stored import NativeFile, StoredArray
@@ -42,7 +42,6 @@ from fhash_formats.container.zip_file import (
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.series import Coordinate, meant
 from fhash_formats.support.files import is_url, local_path
-from fhash_formats.transform.head import INPUTS
 
 
 def check_beside(header: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> None:
@@ -66,22 +65,6 @@ def check_beside(header: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -
         raise DamagedFileError(
             f"array {STEPS} is {array.dtype} {array.shape}; the header asks for uint8 {shape}"
         )
-
-
-def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """(outputs, inputs) of each layer of the network or the head, from the header's `model`."""
-    if model.get("profile") == COMPACT:
-        head = model["head"]
-        if head is None:
-            return []
-        widths = [INPUTS, *head["widths"], 1]
-    else:
-        widths = [
-            len(model["levels"]) * model["embedding_size"],
-            *[model["width"]] * model["hidden_layers"],
-            1,
-        ]
-    return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
 
 
 KEY_FRAMES = "key_frames"
@@ -223,7 +206,7 @@ class Container:
             "fhash" of the root.
         attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
-        arrays: StoredArray by path, in the order of the file.
+        arrays: StoredArray by name, in the order of the file; of several variables by path.
         variables: of a file of several, by name in the order of its list; each is a container as
             if it were alone in the file. None in a file of one variable.
         variable: name of the variable where the container is one of those; else None.
@@ -267,9 +250,14 @@ class Container:
         attributes = json.loads(root.text)["attributes"]
         headers = read_headers(attributes.pop("fhash"))
         self.attributes = MappingProxyType(attributes)
+        mlps = {path_of(header, TABLE): header[MLP] for header in headers.values()}
         stored = {
             node.number: StoredArray(
-                self.path, file, node, ArrayMetadata.from_dict(json.loads(node.text)), self._source
+                self.path,
+                file,
+                node,
+                ArrayMetadata.from_dict(json.loads(node.text), mlps.get(node.path)),
+                self._source,
             )
             for node in nodes
             if node.number
@@ -283,10 +271,10 @@ class Container:
                 check_beside(header, arrays)
                 check_source(header, arrays)
             variables.append((name, header, arrays))
-        self.arrays = MappingProxyType({array.name: array for array in stored.values()})
         if len(variables) == 1:
-            self._name, self.header, _ = variables[0]
+            self._name, self.header, self.arrays = variables[0]
             return
+        self.arrays = MappingProxyType({array.name: array for array in stored.values()})
         self.header = json.loads(root.text)["attributes"]["fhash"]
         self.variables = MappingProxyType(
             {
@@ -465,7 +453,7 @@ class VariableContainer(Container):
         self._container, self._source, self._file = file, file._source, file._file
         self._closes_file = False
         shared = [name for name in header.get(SHARES, ()) if not name.startswith(AUXILIARY)]
-        begin = group_of(number)
+        begin = path_of(header, "")
         self._own = [
             name for name, array in arrays.items() if name in shared or array.name.startswith(begin)
         ]

@@ -6,7 +6,7 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import product
 from math import prod
@@ -24,9 +24,10 @@ from fhash_formats.container.array import (
     Codec,
     chunk_coder,
     plain_codecs,
+    without_mlp,
 )
-from fhash_formats.container.header import FORMAT, brief
-from fhash_formats.container.hierarchy import GROUP, SHARES, VARIABLES, group_of
+from fhash_formats.container.header import FORMAT, MLP, TABLE, brief
+from fhash_formats.container.hierarchy import GROUP, GROUP_KEY, SHARES, VARIABLES
 from fhash_formats.container.reader import Container
 from fhash_formats.container.record import dumps
 from fhash_formats.container.source_entry import AUXILIARY
@@ -171,6 +172,7 @@ class _Variable:
             array that lies there.
         mark: of the file before its first array; None for the only variable.
         written: paths of its arrays by name.
+        mlp: of its tiles, for the header.
     """
 
     name: str | None
@@ -179,6 +181,7 @@ class _Variable:
     shares: dict[str, Any] = field(default_factory=dict)
     mark: Mark | None = None
     written: dict[str, str] = field(default_factory=dict)
+    mlp: Mapping[str, Any] | None = None
 
 
 CODED = ("shape", "data_type", "chunk_grid", "codecs", "attributes")
@@ -409,6 +412,9 @@ class ContainerWriter:
 
     def _describe(self, name: str, metadata: ArrayMetadata) -> None:
         """Take the metadata of an array, whose document is written with those of all."""
+        if name == TABLE and metadata.together is not None:
+            codec, self._current().mlp = without_mlp(metadata.codecs[0])
+            metadata = replace(metadata, codecs=[codec])
         values = metadata.to_dict()
         dumps(values, f"the metadata of array {name}")
         self._arrays[self._path(name)] = values
@@ -459,6 +465,7 @@ class ContainerWriter:
             if member.name.startswith(f"{path}/")
         }
         coded = [[name, *map(self._arrays[path].get, CODED)] for path, name in tables.items()]
+        coded.append([variable.mlp])
         sizes = [(place, member.size, member.crc) for place, member in contents.items()]
         look = sha256(repr((coded, sizes)).encode()).digest()
         number, others = self._finished.setdefault(look, (variable.number, contents))
@@ -547,6 +554,10 @@ class ContainerWriter:
         entry: dict[str, Any] = plain_json(header)
         if variable.name not in (None, entry.get("variable", {}).get("name")):
             entry["name"] = variable.name
+        if self.one_of_several:
+            entry[GROUP_KEY] = f"v{variable.number}"
+        if variable.mlp is not None:
+            entry[MLP] = variable.mlp
         if variable.shares:
             entry[SHARES] = variable.shares
         if variable.number:
@@ -603,7 +614,7 @@ class ContainerWriter:
     def _path(self, name: str) -> str:
         """The path of an array in the hierarchy."""
         number = self._current().number
-        return group_of(number) + name if self.one_of_several else name
+        return f"v{number}/{name}" if self.one_of_several else name
 
     def _add_member(
         self, name: str, metadata: ArrayMetadata, index: tuple[int, ...], chunks: Sequence[bytes]

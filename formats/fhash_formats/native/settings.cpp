@@ -186,63 +186,10 @@ bool read_axes(Bytes& data, const uint8_t* packed, Settings& settings, fhash_err
     return true;
 }
 
-// A whole number of any size, 32 bits a limb, the lowest first.
-struct Big {
-    std::vector<uint32_t> limbs;
-
-    uint32_t divide(uint32_t divisor) {
-        uint64_t rest = 0;
-        for (size_t i = limbs.size(); i-- > 0;) {
-            rest = rest << 32 | limbs[i];
-            limbs[i] = (uint32_t)(rest / divisor);
-            rest %= divisor;
-        }
-        trim();
-        return (uint32_t)rest;
-    }
-    void multiply_add(uint32_t factor, uint32_t more) {
-        uint64_t carry = more;
-        for (uint32_t& limb : limbs) {
-            carry += (uint64_t)limb * factor;
-            limb = (uint32_t)carry;
-            carry >>= 32;
-        }
-        if (carry) limbs.push_back((uint32_t)carry);
-    }
-    void trim() {
-        while (!limbs.empty() && limbs.back() == 0) limbs.pop_back();
-    }
-};
-
-// The weights of a layer of a head, which are popped from the state (transform/head.py).
-bool pop_weights(Big& state, int spread, int64_t count, float* weights) {
-    if (spread < 1) return false;
-    const uint64_t square = (uint64_t)spread * (uint64_t)spread;
-    uint32_t frequencies[2 * MAX_WEIGHT + 1], starts[2 * MAX_WEIGHT + 2] = {0};
-    for (int weight = -MAX_WEIGHT; weight <= MAX_WEIGHT; weight++) {
-        const uint64_t sum = square + (uint64_t)(weight * weight);
-        const int i = weight + MAX_WEIGHT;
-        frequencies[i] = (uint32_t)(1 + (square * square << 16) / (sum * sum));
-        starts[i + 1] = starts[i] + frequencies[i];
-    }
-    const uint32_t total = starts[2 * MAX_WEIGHT + 1];
-    for (int64_t k = 0; k < count; k++) {
-        const uint32_t rest = state.divide(total);
-        const auto above = std::upper_bound(starts, starts + 2 * MAX_WEIGHT + 2, rest);
-        const int i = (int)(above - starts) - 1;
-        state.multiply_add(frequencies[i], rest - starts[i]);
-        weights[k] = (float)(i - MAX_WEIGHT);
-    }
-    return true;
-}
-
 bool no_head(fhash_error& error, const char* what) {
     return fail(error, FHASH_ERROR_DAMAGED,
                 "the settings of a coded tile are damaged: a damaged neighbourhood head: %s", what);
 }
-
-// What is added to the number of hidden layers since heads look along t, too: in no file of before.
-constexpr uint8_t HEAD_MARK = 16;
 
 // The widths of the layers of a head.
 bool read_widths(Bytes& data, Head& head, fhash_error& error) {
@@ -250,8 +197,6 @@ bool read_widths(Bytes& data, Head& head, fhash_error& error) {
     uint8_t count;
     const uint8_t* widths;
     if (!data.number(count)) return no_head(error, "it is cut");
-    if (count < HEAD_MARK) return no_head(error, "it looks at other neighbours");
-    count = uint8_t(count - HEAD_MARK);
     if (count < 1 || count > MAX_HIDDEN || !data.take(count, widths))
         return no_head(error, "its hidden layers");
     head.widths = {28};
@@ -282,25 +227,17 @@ bool read_range(Bytes& data, Head& head, float& sigma, fhash_error& error) {
 bool read_layers(Bytes& data, Head& head, float sigma, fhash_error& error) {
     const int64_t layers = head.layers();
     std::vector<float> bias_scales;
-    std::vector<int> spreads;
     for (int64_t l = 0; l < layers; l++) {
         uint16_t weight, bias;
-        uint8_t spread;
-        if (!data.number(weight) || !data.number(bias) || !data.number(spread))
-            return no_head(error, "it is cut");
+        if (!data.number(weight) || !data.number(bias)) return no_head(error, "it is cut");
         // A positive float16 value that is finite.
         if (weight == 0 || weight >= 0x7c00 || bias == 0 || bias >= 0x7c00)
             return no_head(error, "its scales");
         const float unit_in = l == 0 ? 512.0f : 128.0f, unit_out = l + 1 == layers ? sigma : 128.0f;
         head.scales.push_back(from_half(weight) / unit_in * unit_out);
         bias_scales.push_back(from_half(bias));
-        spreads.push_back(spread);
     }
-    int64_t weight_count = 0;
-    std::vector<int64_t> sizes;
     for (int64_t l = 0; l < layers; l++) {
-        sizes.push_back(head.widths[(size_t)l] * head.widths[(size_t)l + 1]);
-        weight_count += sizes.back();
         const float unit_out = l + 1 == layers ? sigma : 128.0f;
         for (int64_t i = 0; i < head.widths[(size_t)l + 1]; i++) {
             int8_t bias;
@@ -308,36 +245,23 @@ bool read_layers(Bytes& data, Head& head, float sigma, fhash_error& error) {
             head.biases.push_back(bias_scales[(size_t)l] * (float)bias * unit_out);
         }
     }
-    if (data.left() > (size_t)(3 * weight_count + 1)) return no_head(error, "its bytes are many");
-    if (!data.left() || !data.end[-1])
-        return no_head(error, "its weights are cut, or have zeros after their end");
-    Big state;
-    for (size_t i = 0; i < data.left(); i += 4) {
-        uint32_t limb = 0;
-        for (size_t b = i; b < std::min(i + 4, data.left()); b++)
-            limb |= (uint32_t)data.at[b] << 8 * (b - i);
-        state.limbs.push_back(limb);
+    size_t count = 0;
+    for (int64_t l = 0; l < layers; l++)
+        count += size_t(head.widths[(size_t)l] * head.widths[(size_t)l + 1]);
+    if (data.left() != count) return no_head(error, "its weights are cut, or too many");
+    int8_t weight;
+    while (data.number(weight)) {
+        if (weight < -MAX_WEIGHT || weight > MAX_WEIGHT) return no_head(error, "its weights");
+        head.weights.push_back(weight);
     }
-    head.weights.resize((size_t)weight_count);
-    float* weights = head.weights.data();
-    for (int64_t l = 0; l < layers; l++) {
-        if (!pop_weights(state, spreads[(size_t)l], sizes[(size_t)l], weights))
-            return no_head(error, "a spread of 0");
-        weights += sizes[(size_t)l];
-    }
-    if (state.limbs.size() != 1 || state.limbs[0] != 1)
-        return no_head(error, "its weights do not end where their code ends");
     return true;
 }
 
 bool read_head(Bytes& data, Settings& settings, fhash_error& error) {
     Bytes block;
-    float sigma = 0;
     if (!read_block(data, block, error)) return false;
     settings.head = std::make_unique<Head>();
-    Head& head = *settings.head;
-    return read_widths(block, head, error) && read_range(block, head, sigma, error) &&
-           read_layers(block, head, sigma, error);
+    return unpack_head(block, *settings.head, error);
 }
 
 bool read_scores(Bytes& data, size_t count, std::vector<int32_t>& scores) {
@@ -459,6 +383,30 @@ bool unpack(Bytes data, Settings& settings, fhash_error& error) {
 }
 
 }  // namespace
+
+bool unpack_head(Bytes block, Head& head, fhash_error& error) {
+    float sigma = 0;
+    return read_widths(block, head, error) && read_range(block, head, sigma, error) &&
+           read_layers(block, head, sigma, error);
+}
+
+bool insert_head(std::string& settings, const std::string& head, fhash_error& error) {
+    const uint8_t* const begin = (const uint8_t*)settings.data();
+    Bytes data = {begin, begin + settings.size()}, block;
+    const uint8_t *first, *rest;
+    if (!data.take(5, first) || !data.take(first[0] & WHOLE ? 55 : 46, rest)) return cut(error);
+    for (int a = 1; a < 5; a++)
+        if (first[a] >> 4 == KLT_KIND && !read_block(data, block, error)) return false;
+    const size_t place = size_t(data.at - begin);
+    if (!(first[0] & HEAD) != head.empty() ||
+        (!head.empty() && (!read_block(data, block, error) || block.left())))
+        return damaged(error, "they have a head of their own, or lack that of the header");
+    std::string length;
+    for (size_t left = head.size(); left; left >>= 7)
+        length += char((left & 127) | (left > 127 ? 128 : 0));
+    if (!head.empty()) settings.replace(place, 1, length + head);
+    return true;
+}
 
 std::shared_ptr<const Settings> unpack_settings(fhash_context& context, const uint8_t* data,
                                                 size_t size, fhash_error& error) {

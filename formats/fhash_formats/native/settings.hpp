@@ -4,6 +4,7 @@
 #include <array>
 #include <cstdint>
 #include <memory>
+#include <string>
 #include <vector>
 
 #include "context.hpp"
@@ -102,5 +103,12 @@ struct Bytes {
     // A whole number in LEB128, of at most five bytes.
     bool leb(uint64_t& value);
 };
+
+// A head from the block that settings have of it.
+bool unpack_head(Bytes block, Head& head, fhash_error& error);
+
+// Puts the block of a head into packed settings, which have an empty one in its place; or checks
+// that they have none, where it is empty.
+bool insert_head(std::string& settings, const std::string& head, fhash_error& error);
 
 }  // namespace fhash

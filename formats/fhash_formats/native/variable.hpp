@@ -11,6 +11,7 @@ constexpr int64_t MAX_LEVELS = 64;
 struct Variable {
     Record top, header;  // of the file, and of the variable
     std::string name, units, attributes;  // the last as JSON text
+    std::string group;  // of its arrays, with "/"; empty for the root
     Json coordinates[4] = {};  // objects of the header; null for whole numbers from 0 on
     std::map<std::string, const Array*> arrays;  // by name (FORMAT.md, Arrays)
     int32_t type = 0;                            // of the source
@@ -24,6 +25,7 @@ struct Variable {
     bool cubic = false;  // monotone cubic between steps, of the profile compact
     int64_t features = 1;
     Record model;
+    std::string mlp;                             // as a block of settings; empty for none
     std::string tables;                          // model.tables
     int32_t values = 0;                          // type of the values, of the profile compact
     std::vector<std::array<int64_t, 4>> levels;  // shapes, the finest first
@@ -36,7 +38,7 @@ struct Variable {
 };
 
 // The variables of a file, complete and checked.
-bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error);
+bool read_variables(Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error);
 
 // Positions along an axis, `shape[axis]` of them.
 void find_positions(const Variable& variable, int axis, double* positions);

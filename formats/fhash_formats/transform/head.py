@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import accumulate
-from math import log2
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -48,93 +44,14 @@ def offsets_in(steps: int) -> npt.NDArray[np.int64]:
     return offsets
 
 
-_MARK = 16
-"""Addend of the number of hidden layers since heads look along t: in no file of before."""
-
-
 INPUTS = len(OFFSETS) + 2
 """Number of inputs: one per neighbour, and two functions of the voxel's own value."""
 
 
 MAX_WEIGHT = 31
 """Largest magnitude of a quantised weight (6 bits)."""
-_SPREADS = range(1, 256)
-"""Spreads that a layer may have."""
-_ROUNDING = 1e-9
-"""Relative error that a sum of bits has at most, in whatever order and by whatever logarithm."""
-
-
-@lru_cache(maxsize=256)
-def _model(spread: int) -> tuple[list[int], list[int]]:
-    """The frequencies of the weights -MAX_WEIGHT to MAX_WEIGHT, and their running sums.
-
-    The sums begin with 0 and end with the total.
-    """
-    square = spread * spread
-    frequencies = [
-        1 + (square * square << 16) // (square + weight * weight) ** 2
-        for weight in range(-MAX_WEIGHT, MAX_WEIGHT + 1)
-    ]
-    return frequencies, [0, *accumulate(frequencies)]
-
-
-@lru_cache(maxsize=1)
-def _bits() -> npt.NDArray[np.float64]:
-    """The bits of each weight -MAX_WEIGHT to MAX_WEIGHT by each of the spreads, nearly."""
-    squares = np.array(_SPREADS, np.int64)[:, None] ** 2
-    weights = np.arange(-MAX_WEIGHT, MAX_WEIGHT + 1)
-    frequencies = 1 + (squares * squares << 16) // (squares + weights * weights) ** 2
-    bits: npt.NDArray[np.float64] = np.log2(frequencies.sum(axis=1, keepdims=True) / frequencies)
-    return bits
-
-
-def best_spread(weights: Sequence[int]) -> int:
-    """The spread in 1 to 255 whose frequencies code the weights in the fewest bits."""
-    counts = sorted(Counter(weights).items())
-
-    def bits(spread: int) -> float:
-        frequencies, starts = _model(spread)
-        return sum(
-            count * log2(starts[-1] / frequencies[weight + MAX_WEIGHT]) for weight, count in counts
-        )
-
-    # Nearly equal sums are formed again in the order that is the same on every machine.
-    places = [weight + MAX_WEIGHT for weight, _ in counts]
-    sums = (_bits()[:, places] * [count for _, count in counts]).sum(axis=1)
-    near = np.flatnonzero(sums <= sums.min() * (1 + _ROUNDING) + _ROUNDING)
-    return min((_SPREADS[place] for place in near.tolist()), key=bits)
-
-
-def encode_weights(state: int, weights: Sequence[int], spread: int) -> int:
-    """The state with the weights pushed onto it; `decode_weights` pops them in order.
-
-    state: the integer that holds everything coded so far.
-    """
-    frequencies, starts = _model(spread)
-    for weight in reversed(weights):
-        index = weight + MAX_WEIGHT
-        quotient, rest = divmod(state, frequencies[index])
-        state = quotient * starts[-1] + starts[index] + rest
-    return state
-
-
-def decode_weights(state: int, count: int, spread: int) -> tuple[int, list[int]]:
-    """The state after its first `count` weights are popped, and the weights.
-
-    Raises ValueError for spread 0.
-    """
-    if spread < 1:
-        raise ValueError("a spread of 0")
-    frequencies, starts = _model(spread)
-    weights = []
-    for _ in range(count):
-        quotient, rest = divmod(state, starts[-1])
-        index = bisect_right(starts, rest) - 1
-        state = quotient * frequencies[index] + rest - starts[index]
-        weights.append(index - MAX_WEIGHT)
-    return state, weights
-
-
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+"
+"""Letter of each weight from -MAX_WEIGHT to MAX_WEIGHT in a header."""
 MAX_HIDDEN = 3
 """Most hidden layers."""
 MAX_WIDTH = 64
@@ -151,10 +68,6 @@ _ACTIVATION_UNIT = 128.0
 """Integer steps of an activation in 1."""
 _WIDEST_LANES = 0
 """Lanes with which the native library computes (head.cpp): the widest that this machine has."""
-_MAX_WEIGHT_BYTES = 3
-"""Bytes that a weight takes at most (22 bits), which bounds the work on hostile bytes."""
-
-
 Scaled = tuple[npt.NDArray[np.int8], float]
 """Whole numbers and the scale that they are multiples of."""
 
@@ -337,23 +250,19 @@ class NeighbourHead:
     def to_bytes(self) -> bytes:
         """The packed head; `from_bytes` is the inverse. All numbers are little-endian.
 
-        First u8 16 + the number of hidden layers, and u8 the width of each; float32 sigma, low,
-        high; per layer float16 the scales of weights and biases, and u8 the spread; then the
-        biases of all layers as int8; then the weights of all layers, row by row, in one integer.
+        First u8 the number of hidden layers, and u8 the width of each; float32 sigma, low, high;
+        per layer float16 the scales of weights and biases; then the biases of all layers as int8;
+        then the weights of all layers, row by row, as int8.
         """
-        spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
-        fields = [
-            bytes([_MARK + len(self.hidden), *self.hidden]),
-            struct.pack("<3f", self.sigma, self.low, self.high),
-        ]
-        for layer, spread in zip(self.layers, spreads, strict=True):
-            fields.append(struct.pack("<eeB", layer.weight_scale, layer.bias_scale, spread))
-        fields += [layer.biases.tobytes() for layer in self.layers]
-        state = 1
-        for layer, spread in reversed(list(zip(self.layers, spreads, strict=True))):
-            state = encode_weights(state, layer.weights.ravel().tolist(), spread)
-        fields.append(state.to_bytes((state.bit_length() + 7) // 8, "little"))
-        return b"".join(fields)
+        return b"".join(
+            [
+                bytes([len(self.hidden), *self.hidden]),
+                struct.pack("<3f", self.sigma, self.low, self.high),
+                *(struct.pack("<2e", each.weight_scale, each.bias_scale) for each in self.layers),
+                *(each.biases.tobytes() for each in self.layers),
+                *(each.weights.tobytes() for each in self.layers),
+            ]
+        )
 
     @classmethod
     def from_bytes(cls, data: bytes) -> NeighbourHead:
@@ -362,50 +271,67 @@ class NeighbourHead:
         Raises DamagedFileError for bytes that are no head.
         """
         try:
-            return cls._read(data)
+            count = data[0]
+            if not 1 <= count <= MAX_HIDDEN:
+                raise ValueError(f"{count} hidden layers")
+            widths = list(data[1 : 1 + count])
+            constants = struct.unpack_from("<3f", data, 1 + count)
+            scales = struct.unpack_from(f"<{2 * count + 2}e", data, 13 + count)
+            numbers = np.frombuffer(data, np.int8, offset=17 + 5 * count)
+            return cls._of(widths, constants, scales, numbers)
         except (struct.error, ValueError, IndexError) as error:
             raise DamagedFileError(f"a damaged neighbourhood head: {error}") from error
 
+    def to_json(self) -> dict[str, Any]:
+        """The head as JSON values (FORMAT.md, MLP); `from_json` is the inverse."""
+        weights = np.concatenate([each.weights.ravel() for each in self.layers])
+        return {
+            "widths": list(self.hidden),
+            "sigma": float(str(np.float32(self.sigma))),
+            "range": [float(str(np.float32(end))) for end in (self.low, self.high)],
+            "scales": [
+                float(str(np.float16(scale)))
+                for each in self.layers
+                for scale in (each.weight_scale, each.bias_scale)
+            ],
+            "biases": [int(bias) for each in self.layers for bias in each.biases],
+            "weights": "".join(LETTERS[weight + MAX_WEIGHT] for weight in weights.tolist()),
+        }
+
     @classmethod
-    def _read(cls, data: bytes) -> NeighbourHead:
-        """The head in some bytes. Raises ValueError, IndexError or struct.error for others."""
-        if data[0] < _MARK:
-            raise ValueError("it looks at other neighbours: of a version before the release")
-        count = data[0] - _MARK
-        if not 1 <= count <= MAX_HIDDEN:
-            raise ValueError(f"{count} hidden layers")
-        widths = [*data[1 : 1 + count], 1]
-        if len(widths) != count + 1 or not all(1 <= width <= MAX_WIDTH for width in widths):
-            raise ValueError(f"layers of widths {widths}")
-        inputs = [INPUTS, *widths[:-1]]
-        sigma, low, high = struct.unpack_from("<3f", data, 1 + count)
-        position = 13 + count
-        scales = [
-            struct.unpack_from("<eeB", data, position + 5 * layer) for layer in range(count + 1)
-        ]
-        position += 5 * (count + 1)
-        biases = []
-        for width in widths:
-            biases.append(np.frombuffer(data, dtype=np.int8, count=width, offset=position))
-            position += width
-        weight_count = sum(rows * columns for rows, columns in zip(inputs, widths, strict=True))
-        if len(data) - position > _MAX_WEIGHT_BYTES * weight_count + 1:
-            raise ValueError(f"{len(data)} bytes are too many")
-        if not data[position:] or not data[-1]:
-            raise ValueError("its weights are cut, or have zeros after their end")
-        state = int.from_bytes(data[position:], "little")
-        layers = []
-        for (weight_scale, bias_scale, spread), columns, bias in zip(
-            scales, inputs, biases, strict=True
-        ):
-            state, weights = decode_weights(state, len(bias) * columns, spread)
-            matrix = np.array(weights, dtype=np.int8).reshape(len(bias), columns)
-            layers.append(
-                Layer(weights=matrix, biases=bias, weight_scale=weight_scale, bias_scale=bias_scale)
+    def from_json(cls, values: Mapping[str, Any]) -> NeighbourHead:
+        """The head of JSON values that libfhash has checked."""
+        weights = [LETTERS.index(letter) - MAX_WEIGHT for letter in values["weights"]]
+        numbers = np.array([*values["biases"], *weights], np.int8)
+        constants = np.array([values["sigma"], *values["range"]], np.float32).tolist()
+        scales = np.array(values["scales"], np.float16).tolist()
+        return cls._of(values["widths"], constants, scales, numbers)
+
+    @classmethod
+    def _of(
+        cls,
+        hidden: Sequence[int],
+        constants: Sequence[float],
+        scales: Sequence[float],
+        numbers: npt.NDArray[np.int8],
+    ) -> NeighbourHead:
+        """The head of its numbers: all biases, then all weights. Raises ValueError for others."""
+        inputs, outputs = (INPUTS, *hidden), (*hidden, 1)
+        sizes = [*outputs, *(n * k for n, k in zip(inputs, outputs, strict=True))]
+        if min(sizes) < 1 or numbers.size != sum(sizes):
+            raise ValueError(f"{numbers.size} weights and biases for widths {list(hidden)}")
+        parts = np.split(numbers, np.cumsum(sizes)[:-1])
+        layers = tuple(
+            Layer(
+                weights=parts[len(outputs) + number].reshape(width, inputs[number]),
+                biases=parts[number],
+                weight_scale=float(scales[2 * number]),
+                bias_scale=float(scales[2 * number + 1]),
             )
-        if state != 1:
-            raise ValueError("its weights do not end where their code ends")
-        return cls(layers=tuple(layers), sigma=sigma, low=low, high=high)
+            for number, width in enumerate(outputs)
+        )
+        sigma, low, high = constants
+        return cls(layers=layers, sigma=sigma, low=low, high=high)
 
 
 def _check_layer(number: int, layer: Layer, inputs: int, most_outputs: int) -> None:

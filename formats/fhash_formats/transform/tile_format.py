@@ -142,8 +142,11 @@ class TileSettings:
         """The packed block; packing a head takes as long as decoding a small tile."""
         return self.to_bytes()
 
-    def to_bytes(self) -> bytes:
-        """The packed block. Raises InputError for ends about an origin that are no int64."""
+    def to_bytes(self, *, apart: bool = False) -> bytes:
+        """The packed block. Raises InputError for ends about an origin that are no int64.
+
+        apart: leave the block of a head empty: a container has the head in its header.
+        """
         whole = self.origin != 0 or any(
             type(end) is int and abs(end) > _EXACT for end in (self.low, self.high)
         )
@@ -175,7 +178,7 @@ class TileSettings:
             struct.pack(f"{OFFSETS}b", *self.offsets),
         ]
         blocks = [axis.basis.to_bytes() for axis in axes if axis.basis is not None]
-        blocks += [] if self.head is None else [self.head.to_bytes()]
+        blocks += [] if self.head is None else [b"" if apart else self.head.to_bytes()]
         parts += [part for block in blocks for part in (varint(len(block)), block)]
         if self.mask is not None:
             parts.append(_pack_mask(self.mask))
@@ -191,17 +194,22 @@ class TileSettings:
         """
         return _unpacked(bytes(data))
 
-    def to_text(self) -> str:
-        """The packed block in base64, as JSON documents have it."""
-        return base64.b64encode(self.packed).decode("ascii")
+    def to_text(self, *, apart: bool = False) -> str:
+        """The packed block in base64, as JSON documents have it; for `apart` see `to_bytes`."""
+        block = self.to_bytes(apart=True) if apart else self.packed
+        return base64.b64encode(block).decode("ascii")
 
     @classmethod
-    def from_text(cls, text: Any) -> TileSettings:
-        """The inverse of `to_text`. Raises DamagedFileError for anything else."""
+    def from_text(cls, text: Any, head: NeighbourHead | None = None) -> TileSettings:
+        """The inverse of `to_text`. Raises DamagedFileError for anything else.
+
+        head: that of a text without it.
+        """
         if not isinstance(text, str) or len(text) > _MAX_TEXT:
             raise DamagedFileError(f"settings of tiles are base64, not {text!r:.40}")
         try:
-            return cls.from_bytes(base64.b64decode(text, validate=True))
+            block = base64.b64decode(text, validate=True)
+            return cls.from_bytes(block) if head is None else _apart(block, head)
         except ValueError as error:
             raise DamagedFileError(f"settings of tiles are no base64 ({error})") from error
 
@@ -212,6 +220,13 @@ def _unpacked(data: bytes) -> TileSettings:
     try:
         return _read(_Bytes(memoryview(data)))
     except (InputError, ValueError) as error:
+        raise DamagedFileError(f"the settings of a coded tile are damaged: {error}") from error
+
+
+def _apart(block: bytes, head: NeighbourHead) -> TileSettings:
+    try:
+        return _read(_Bytes(memoryview(block)), head)
+    except InputError as error:
         raise DamagedFileError(f"the settings of a coded tile are damaged: {error}") from error
 
 
@@ -238,14 +253,16 @@ class _Bytes:
         return self.take(count)
 
 
-def _read(data: _Bytes) -> TileSettings:
+def _read(data: _Bytes, head: NeighbourHead | None = None) -> TileSettings:
     flags, *axes = data.numbers("5B")
     step, quantum, center = data.numbers("3d")
     low, high = data.numbers("2q" if flags & _WHOLE else "2d")
     origin = int.from_bytes(data.take(_ORIGIN), "little", signed=True) if flags & _WHOLE else 0
     offsets = data.numbers(f"{OFFSETS}b")
     t, z, y, x = (_read_axis(data, *divmod(axis, 16)) for axis in axes)
-    head = NeighbourHead.from_bytes(data.block()) if flags & _HEAD else None
+    if flags & _HEAD:
+        block = data.block()
+        head = NeighbourHead.from_bytes(block) if block or head is None else head
     mask = _read_mask(data) if flags & _MASK else None
     predictor = _read_predictor(data) if flags & _PREDICTOR else None
     if len(data.rest):

@@ -14,83 +14,6 @@ namespace {
 
 std::string lattice_table(size_t level) { return "tables/level_" + std::to_string(level); }
 
-struct Widths {
-    std::vector<int64_t> hidden;
-
-    size_t layers() const { return hidden.size() + 1; }
-    int64_t outputs(size_t layer) const { return layer < hidden.size() ? hidden[layer] : 1; }
-    int64_t inputs(size_t layer) const { return layer ? hidden[layer - 1] : 28; }
-};
-
-bool read_widths(const Record& head, Widths& widths, fhash_error& error) {
-    const Json hidden = head.find("widths");
-    const size_t count = yyjson_is_arr(hidden) ? yyjson_arr_size(hidden) : 0;
-    if (!head.need(count >= 1 && count <= 3, "widths", "1 to 3 widths", error)) return false;
-    widths.hidden.resize(count);
-    return head.integers("widths", count, 1, 64, widths.hidden.data(), error);
-}
-
-// All values of an array as whole multiples of its attribute `scale`.
-bool read_whole(fhash_file& file, const Variable& variable, const std::string& name, double most,
-                std::vector<float>& numbers, double& scale, fhash_error& error) {
-    const Array& array = *variable.find(name);
-    const Record attributes = {array.attributes, "array " + name + " attribute "};
-    Region all;
-    all.last = array.shape;
-    Buffer bytes;
-    if (!attributes.number("scale", scale, error) ||
-        !attributes.need(scale > 0, "scale", "above 0", error) ||
-        !read_region(file, array, all, bytes, nullptr, error))
-        return false;
-    const float* const stored = reinterpret_cast<const float*>(bytes.data());
-    for (size_t i = 0; i < bytes.size() / 4; i++) {
-        const double number = double(stored[i]) / scale, whole = std::nearbyint(number);
-        if (!(std::fabs(number - whole) <= 1e-3) || std::fabs(whole) > most)
-            return fail(error, FHASH_ERROR_DAMAGED,
-                        "array %s has numbers that are no multiples of its scale", name.c_str());
-        numbers.push_back(float(whole));
-    }
-    // Scales are positive float16 values, so that all products are exact.
-    return double(from_half(to_half(scale))) == scale && scale < 65520 ? true
-           : fail(error, FHASH_ERROR_DAMAGED, "array %s has a scale that is no float16",
-                  name.c_str());
-}
-
-bool read_head(fhash_file& file, const Variable& variable, Head& head, fhash_error& error) {
-    Record described;
-    Widths widths;
-    double sigma = 0, low = 0, high = 0;
-    if (!variable.model.record("head", described, error) ||
-        !read_widths(described, widths, error) || !described.number("sigma", sigma, error) ||
-        !described.number("low", low, error) || !described.number("high", high, error))
-        return false;
-    const bool narrow = double(float(sigma)) == sigma && double(float(low)) == low &&
-                        double(float(high)) == high;
-    if (!narrow || !(sigma >= 0x1p-100 && sigma <= 0x1p100) || low > high)
-        return fail(error, FHASH_ERROR_DAMAGED, "the head of a plain file has a wrong range");
-    head.widths = {28};
-    for (size_t layer = 0; layer < widths.layers(); layer++) {
-        const std::string number = std::to_string(layer + 1);
-        std::vector<float> biases;
-        double weight_scale = 0, bias_scale = 0;
-        if (!read_whole(file, variable, "mlp/weight_" + number, 31, head.weights, weight_scale,
-                        error) ||
-            !read_whole(file, variable, "mlp/bias_" + number, 127, biases, bias_scale, error))
-            return false;
-        const float unit_in = layer ? 128.0f : 512.0f;
-        const float unit_out = layer + 1 == widths.layers() ? float(sigma) : 128.0f;
-        head.scales.push_back(float(weight_scale / double(unit_in)) * unit_out);
-        for (const float bias : biases) head.biases.push_back(float(bias_scale) * bias * unit_out);
-        head.widths.push_back(widths.outputs(layer));
-    }
-    const float span = float(high) - float(low);
-    float unit = span > 0 ? 1024.0f / span : 0.0f;
-    if (!std::isfinite(unit)) unit = 0.0f;
-    const float constants[4] = {float(low), float(high), 0.5f / float(sigma), unit};
-    std::copy(constants, constants + 4, head.constants);
-    return true;
-}
-
 // Adds corrections to predicted values of one type.
 template <class T> bool correct(T* values, const Buffer& corrections, int32_t type) {
     const bool narrow = type == FHASH_FLOAT32;
@@ -225,31 +148,8 @@ bool check_plain(const Variable& variable, fhash_error& error) {
     if (!check_array(variable, "corrections", finest, {FHASH_FLOAT32, FHASH_FLOAT64}, false,
                      error))
         return false;
-    if (!model.find_value("head"))
-        return model.need(model.find("head") != nullptr, "head", "an object or null", error);
-    Record head;
-    Widths widths;
-    if (!model.need(narrow, "tables", "float32 where there is a head", error) ||
-        !model.record("head", head, error) || !read_widths(head, widths, error))
-        return false;
-    for (size_t layer = 0; layer < widths.layers(); layer++) {
-        const std::string number = std::to_string(layer + 1);
-        if (!check_array(variable, ("mlp/weight_" + number).c_str(),
-                         {widths.outputs(layer), widths.inputs(layer)}, {FHASH_FLOAT32}, true,
-                         error) ||
-            !check_array(variable, ("mlp/bias_" + number).c_str(), {widths.outputs(layer)},
-                         {FHASH_FLOAT32}, true, error))
-            return false;
-        for (const char* kind : {"weight_", "bias_"}) {
-            const std::string name = std::string("mlp/") + kind + number;
-            const Record unit = {variable.find(name)->attributes, "array " + name + " attribute "};
-            double scale = 0;
-            if (!unit.number("scale", scale, error) ||
-                !unit.need(scale > 0, "scale", "above 0", error))
-                return false;
-        }
-    }
-    return true;
+    return model.need(narrow || variable.mlp.empty(), "tables", "float32 where there is an MLP",
+                      error);
 }
 
 bool read_plain(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
@@ -262,13 +162,14 @@ bool read_plain(fhash_file& file, const Variable& variable, int64_t key, const L
     frame.mask.assign(size_t(count), 0);
     if (!add_occupancy(file, variable, key, lattice, frame.mask, error)) return false;
     if (lattice.lod) return read_coarse(file, variable, key, lattice, frame, error);
-    if (!variable.model.find_value("head"))  // no value depends on others of its tile
+    if (variable.mlp.empty())  // no value depends on others of its tile
         return read_part(file, variable, nullptr, lattice.region(key, key + 1), frame.values,
                          error);
     Head head;
     int64_t tile[4];
+    const uint8_t* const mlp = reinterpret_cast<const uint8_t*>(variable.mlp.data());
     if (!variable.model.integers("tile", 4, 1, MAX_LENGTH, tile, error) ||
-        !read_head(file, variable, head, error))
+        !unpack_head({mlp, mlp + variable.mlp.size()}, head, error))
         return false;
     const Region all = lattice.region(key, key + 1);
     int64_t place[4];

@@ -4,6 +4,9 @@
 #include <cmath>
 #include <cstring>
 
+#include "bytes.hpp"
+#include "settings.hpp"
+
 namespace fhash {
 
 const char* const AXES[4] = {"time", "z", "y", "x"};
@@ -219,6 +222,55 @@ bool read_coordinates(std::vector<Variable>& all, size_t number, fhash_error& er
     return true;
 }
 
+constexpr char LETTERS[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+constexpr int MIDDLE = 31;  // letter of a weight of 0
+
+template <class T> void add_bytes(std::string& block, T value) {
+    char bytes[sizeof value];
+    std::memcpy(bytes, &value, sizeof value);
+    block.append(bytes, sizeof value);
+}
+
+// The MLP in the header, as the block that settings of tiles have of it.
+bool read_mlp(Variable& variable, fhash_error& error) {
+    Record mlp;
+    int64_t widths[3], biases[193];
+    double constants[3];
+    if (!variable.compact || !variable.header.find_value("mlp")) return true;
+    if (!variable.header.record("mlp", mlp, error)) return false;
+    const size_t count = yyjson_arr_size(mlp.find("widths"));
+    if (!mlp.need(count >= 1 && count <= 3, "widths", "1 to 3 widths", error) ||
+        !mlp.integers("widths", count, 1, 64, widths, error) ||
+        !mlp.number("sigma", constants[0], error) ||
+        !mlp.numbers("range", 2, constants + 1, error))
+        return false;
+    std::string block(1, char(count)), weights;
+    size_t all = 1;
+    for (size_t i = 0; i < count; i++) {
+        block += char(widths[i]);
+        all += size_t(widths[i]);
+    }
+    for (const double each : constants) add_bytes(block, float(each));
+    double scales[8];
+    if (!mlp.numbers("scales", 2 * (count + 1), scales, error)) return false;
+    for (size_t i = 0; i < 2 * (count + 1); i++) add_bytes(block, to_half(scales[i]));
+    if (!mlp.integers("biases", all, -127, 127, biases, error) ||
+        !mlp.text("weights", weights, error))
+        return false;
+    for (size_t i = 0; i < all; i++) block += char(biases[i]);
+    for (const char letter : weights) {
+        const char* const place = std::strchr(LETTERS, letter);
+        if (!mlp.need(place && letter && letter != '/', "weights", "letters of base64", error))
+            return false;
+        block += char(int(place - LETTERS) - MIDDLE);
+    }
+    const uint8_t* const begin = reinterpret_cast<const uint8_t*>(block.data());
+    Head head;
+    variable.mlp = block;
+    return unpack_head({begin, begin + block.size()}, head, error) ||
+           fail_in(error, "header key mlp");
+}
+
 // Checks the arrays that both profiles, and the profile compact, are read from.
 bool check_arrays(const Variable& variable, fhash_error& error) {
     const auto& level = variable.levels[0];
@@ -258,21 +310,33 @@ bool read_header(Variable& variable, fhash_error& error) {
                               "features", "a list of texts", error))
         return false;
     return read_values(variable, error) && read_box(variable, error) &&
-           read_model(variable, error);
+           read_model(variable, error) && read_mlp(variable, error);
 }
 
-// The arrays of the variables by their names: of one their paths, of several those below v0, v1 ...
-void place_own(const Hierarchy& hierarchy, std::vector<std::map<std::string, const Array*>>& own) {
-    for (const auto& each : hierarchy.arrays) {
-        const std::string& path = each.first;
-        const size_t slash = path.find('/');
-        const std::string group = path.substr(0, slash);
-        if (own.size() == 1) own[0][path] = &each.second;
-        if (own.size() == 1 || slash == std::string::npos || group.size() > 10) continue;
-        const size_t number = size_t(std::strtoull(group.c_str() + 1, nullptr, 10));
-        if (number < own.size() && group == "v" + std::to_string(number))
-            own[number][path.substr(slash + 1)] = &each.second;
-    }
+const char* const TABLE = "tables/level_1";
+
+// Reads the beginning of the paths of a variable's arrays; of one of several this is a group.
+bool read_group(std::vector<Variable>& all, size_t number, fhash_error& error) {
+    std::string group;
+    Variable& variable = all[number];
+    if (all.size() == 1 && !variable.header.find("group")) return true;
+    if (!variable.header.text("group", group, error) ||
+        !variable.header.need(group == "v" + std::to_string(number), "group",
+                              "v and the number of the variable", error))
+        return false;
+    variable.group = group + "/";
+    return true;
+}
+
+// The arrays of a variable by their names.
+std::map<std::string, const Array*> own_arrays(const Hierarchy& hierarchy,
+                                               const Variable& variable) {
+    std::map<std::string, const Array*> own;
+    const std::string& group = variable.group;
+    for (const auto& each : hierarchy.arrays)
+        if (each.first.compare(0, group.size(), group) == 0)
+            own[each.first.substr(group.size())] = &each.second;
+    return own;
 }
 
 // Gives a variable the arrays that lie with others.
@@ -386,7 +450,7 @@ static bool in_variable(const std::vector<Variable>& all, size_t number, fhash_e
     return all.size() > 1 && fail_in(error, "variable '" + shown(all[number].name.c_str()) + "'");
 }
 
-bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error) {
+bool read_variables(Hierarchy& hierarchy, std::vector<Variable>& found, fhash_error& error) {
     const Record top = {yyjson_obj_get(hierarchy.root, "fhash"), "header key "};
     const Json list = top.find("variables");
     const size_t count = yyjson_is_arr(list) ? yyjson_arr_size(list) : 0;
@@ -408,13 +472,20 @@ bool read_variables(const Hierarchy& hierarchy, std::vector<Variable>& found, fh
             !top.need(names.insert(variable.name).second, "variables",
                       "of names that stand once", error))
             return false;
-        if (!read_header(variable, error)) return in_variable(found, i, error);
+        if (!read_header(variable, error) || !read_group(found, i, error))
+            return in_variable(found, i, error);
+        own[i] = own_arrays(hierarchy, variable);
     }
-    place_own(hierarchy, own);
     for (size_t i = 0; i < count; i++) {
         found[i].arrays = own[i];
         if (!read_coordinates(found, i, error) || !add_shared(found[i], own, error) ||
             !check_arrays(found[i], error))
+            return in_variable(found, i, error);
+        const auto table = hierarchy.arrays.find(found[i].group + TABLE);
+        if (!found[i].compact || found[i].plain || table == hierarchy.arrays.end()) continue;
+        std::string& settings = table->second.settings;
+        const bool apart = settings.empty() && found[i].mlp.empty();  // each tile has its own
+        if (!apart && !insert_head(settings, found[i].mlp, error))
             return in_variable(found, i, error);
     }
     return true;
