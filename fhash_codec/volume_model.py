@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box, Mlp, Spans, Table
 from fhash_codec.compact.model import CompactModel, equal_places
 from fhash_codec.features.key_frames import KeyTimes
-from fhash_codec.features.occupancy import pack, packed_bytes
+from fhash_codec.features.occupancy import BLOCK, pack, packed_bytes
 from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
 from fhash_formats.container.header import BITS_ARRAY, LAYERS, TABLE
@@ -148,7 +148,7 @@ class Card:
         }
 
     def _describe_mlp(self) -> list[CardLayer]:
-        """The layers: in arrays of their own, all in one, or packed in the coded table."""
+        """The layers: in arrays of their own, all in one, or in the header."""
         count, together = len(self.mlp.weights), LAYERS in self.container.arrays
         return [
             {
@@ -157,7 +157,7 @@ class Card:
                 "activation": self.mlp.activation if number < count else "linear",
                 **self._stored(
                     LAYERS if together else f"mlp/weight_{number}",
-                    f"packed in the codec of {self._table_path}",
+                    "whole numbers in the header",
                 ),
             }
             for number, weights in enumerate(self.mlp.weights, start=1)
@@ -170,10 +170,18 @@ class Card:
         names = [str(name) for name in self.container.header["features"]]
         apart = names if self.profile == "paper" and len(names) > 1 else []
         if BITS_ARRAY in arrays:
-            return {"shape": shape, **self._stored(BITS_ARRAY, ""), "apart": apart}
+            stored = self._stored(BITS_ARRAY, "")
+            block = arrays[BITS_ARRAY].attributes.get(BLOCK, 1)
+            if self.profile == "compact" and block > 1:
+                stored["coding"] = f"blocks of {block} vertices; {self._in_tiles}"
+            return {"shape": list(arrays[BITS_ARRAY].shape[1:]), **stored, "apart": apart}
         masked = self.container.arrays[TABLE].masked
-        coding = f"in the tiles of {self._table_path}" if masked else "every vertex of the box"
+        coding = self._in_tiles if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}
+
+    @property
+    def _in_tiles(self) -> str:
+        return f"of every vertex in the tiles of {self._table_path}"
 
     @property
     def _table_path(self) -> str:

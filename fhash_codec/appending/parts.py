@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice, product
 from math import prod
 from pathlib import Path
@@ -23,6 +23,7 @@ from fhash_codec.compact.tiles import Blocks, CodedTiles
 from fhash_codec.comparison import Report, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Extent, packed_masks, resolve_features
+from fhash_codec.features.occupancy import read_bits, unpack, write_blocks
 from fhash_codec.features.scan import Scan, scan_steps
 from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import (
@@ -264,6 +265,8 @@ class _Job:
             streams=coded.streams,
         )
         parts.write(writer)
+        if parts.settings.mask is not None:  # of vertices: the blocks of the whole are not known
+            write_blocks(writer, partial(self._mask, blocks), parts.shape, 0)
         own = deepcopy(dict(plan.header))
         own["required_features"] = ["transform"]
         own["model"]["levels"] = [list(parts.shape)]
@@ -272,6 +275,12 @@ class _Job:
         gaps = plan.samples < prod(self.series.shape)
         told = describe_source(steps, value_range, plan.config, gaps=gaps)
         return {**told, **described, **own, PART: source}
+
+    def _mask(self, blocks: Blocks, step: int) -> npt.NDArray[np.bool_]:
+        """The mask (z, y, x) of the box at a step of the part."""
+        at = self.steps.start + step
+        found = blocks.masks(range(at, at + 1))
+        return np.ones(blocks.shape[1:], np.bool_) if found is None else found[0]
 
     def _measured(
         self, writer: ContainerWriter, header: Mapping[str, Any], progress: Progress
@@ -601,6 +610,8 @@ class _Whole:
         )
         progress("merging", 0, 1, "")
         table.write(writer)
+        if table.settings.mask is not None:
+            self._write_blocks(writer, table)
         progress("merging", 1, 1, "")
         header["variable"] = self._variable()
         if SOURCE in first.container.header[PART]:
@@ -642,6 +653,17 @@ class _Whole:
                 steps = enumerate(stored.read(), start=part.first)
                 rows.update({step: bits for step, bits in steps if bits.any()})
         return rows
+
+    def _write_blocks(self, writer: ContainerWriter, table: TableParts) -> None:
+        """Write the occupancy of the whole."""
+        _, *box = table.shape
+
+        def mask(step: int) -> npt.NDArray[np.bool_]:
+            part = next(part for part in reversed(self._parts) if part.first <= step)
+            (bits,) = read_bits(part.container, step - part.first, step - part.first + 1)
+            return unpack(bits, (box[0], box[1], box[2]))
+
+        write_blocks(writer, mask, table.shape, int(self.streams.sizes().sum()))
 
     def _model(self, table: TableParts) -> dict[str, Any]:
         """The model of the whole: that of a part, with the numbers of all of them."""

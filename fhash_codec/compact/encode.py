@@ -53,6 +53,7 @@ from fhash_codec.compact.tiles import (
 from fhash_codec.compact.transform import refit, usual_transform
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Everything
+from fhash_codec.features.occupancy import write_blocks
 from fhash_codec.features.selection import FeatureSelection, select_features
 from fhash_codec.header import GAIN, HEAD_POINTS, brief_history, describe_source, write_series
 from fhash_codec.measure.errors import bulk_of_ranks, find_bulk
@@ -651,6 +652,9 @@ def encode_compact(
         parts = table.parts
         with stage("writing", "tiles"):
             parts.write(writer)
+            if parts.settings.mask is not None:
+                extent, size = selection.extent, sum(map(len, parts.streams))
+                write_blocks(writer, extent.mask, parts.shape, size)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         own = table_header(series, selection, table, config, seconds)
         own["required_features"] = ["transform"]

@@ -274,7 +274,7 @@ class Blocks:
         if held is not None and held.dtype == self.source_dtype and not self.origin:
             values = held[(slice(steps.start, steps.stop), *self._extent.box.slices())]
             values.flags.writeable = False  # it is the caller's
-            return Tile(values, self._masks(steps))
+            return Tile(values, self.masks(steps))
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.source_dtype)
         for block, whole in one_ahead(self._series.blocks(steps)):
             frames = whole[:, *self._extent.box.slices()]
@@ -285,9 +285,9 @@ class Blocks:
                 frames = cast(np.where(np.isfinite(frames), frames, 0.0), self.source_dtype)
             values[block.start - steps.start :][: len(block)] = frames
         values = about_origin(values, self.origin) if self.origin else values
-        return Tile(values, self._masks(steps))
+        return Tile(values, self.masks(steps))
 
-    def _masks(self, steps: range) -> Mask | None:
+    def masks(self, steps: range) -> Mask | None:
         """Return which vertices of the box are in the coreset at some steps; None for all."""
         if self.complete:
             return None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,10 @@ import numpy.typing as npt
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.header import BITS_ARRAY
 
+BLOCK = "block"
+"""Attribute of the occupancy: vertices of a block along each axis; 1 without it."""
+BLOCK_SHARE = 100
+"""The bits of blocks take at most this part of the bytes of the tiles."""
 CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of an array of bits. A member for each row would cost 130 bytes."""
 
@@ -89,7 +93,11 @@ def unpack(bits: Bits, shape: Shape) -> npt.NDArray[np.bool_]:
 
 
 def write_bits(
-    writer: ContainerWriter, name: str, shape: Sequence[int], row: Callable[..., Bits]
+    writer: ContainerWriter,
+    name: str,
+    shape: Sequence[int],
+    row: Callable[..., Bits],
+    attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """Write an array (..., rows, bytes) of bits, several rows to a chunk.
 
@@ -111,7 +119,62 @@ def write_bits(
         dtype=np.uint8,
         chunk_shape=(*(1 for _ in outer), together, size),
         chunks=chunks(),
+        attributes=attributes,
     )
+
+
+def write_blocks(
+    writer: ContainerWriter,
+    masks: Callable[[int], npt.NDArray[np.bool_]],
+    shape: Sequence[int],
+    table_bytes: int,
+) -> None:
+    """Write which blocks of vertices have some of the coreset at each key frame.
+
+    Args:
+        writer: of a container whose tiles have exact masks.
+        masks: gives the mask (z, y, x) of the box at a key frame.
+        shape: key frames and lengths of the box.
+        table_bytes: of the tiles, from which the size of the blocks follows; 0 for single vertices.
+    """
+    keys, *box = shape
+    block = block_of(shape, table_bytes) if table_bytes else 1
+    size = packed_bytes(blocks_of(box, block))
+    write_bits(
+        writer,
+        BITS_ARRAY,
+        (1, keys, size),
+        lambda _, key: pack(any_of_blocks(masks(key), block)),
+        {BLOCK: block} if block > 1 else None,
+    )
+
+
+def block_of(shape: Sequence[int], table_bytes: int) -> int:
+    """Side of the blocks whose bits take at most BLOCK_SHARE of the bytes of the tiles.
+
+    It is the least power of two; of few bytes that which makes one block of the box. The bytes are
+    those of the bits as they are, so that whoever knows those of the tiles finds the same side.
+    """
+    keys, *box = shape
+    block = 1
+    while keys * packed_bytes(blocks_of(box, block)) * BLOCK_SHARE > table_bytes:
+        if block >= max(box):
+            break
+        block *= 2
+    return block
+
+
+def blocks_of(box: Sequence[int], block: int) -> Shape:
+    """Number of blocks along z, y and x."""
+    z, y, x = (-(-length // block) for length in box)
+    return z, y, x
+
+
+def any_of_blocks(mask: npt.NDArray[np.bool_], block: int) -> npt.NDArray[np.bool_]:
+    """Which blocks of a mask (z, y, x) have a vertex; a block at an end may be shorter."""
+    for axis, length in enumerate(mask.shape):
+        mask = np.logical_or.reduceat(mask, range(0, length, block), axis=axis)
+    return mask
 
 
 def read_bits(

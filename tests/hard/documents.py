@@ -13,8 +13,8 @@ import numpy as np
 from containers import Parts, with_crc
 from numcodecs.zstd import compress, decompress
 
-from fhash_formats.container.header import POSITIONS, TABLE
-from fhash_formats.container.hierarchy import array_path
+from fhash_formats.container.header import TABLE
+from fhash_formats.container.hierarchy import path_of
 
 DOCUMENT = "zarr.json"
 """End of the names of metadata documents; alone, the name of the root's."""
@@ -141,9 +141,20 @@ def without(parts: Parts, *beginnings: str) -> Parts:
     return [(name, data) for name, data in parts if not name.startswith(beginnings)]
 
 
+def groups_of(parts: Parts) -> dict[str, bytes]:
+    """Return the documents of the groups in which the nodes of a file lie, but for the root."""
+    names = [name.split("/")[:-2] for name, _ in parts if name.endswith(f"/{DOCUMENT}")]
+    return {
+        "/".join([*folders[:depth], DOCUMENT]): GROUP
+        for folders in names
+        for depth in range(1, len(folders) + 1)
+    }
+
+
 def added(parts: Parts, new: Parts, root: Any = None) -> Parts:
-    """Return a file with further members before those that it has; the root's document is last."""
-    every = {**dict(new), **dict(parts)}
+    """Return a file with further members before those that it has, and groups for their documents;
+    the root's document is last."""
+    every = {**groups_of(new), **dict(new), **dict(parts)}
     document = every.pop(DOCUMENT, b"")
     return [*every.items(), (DOCUMENT, document if root is None else dumped(root))]
 
@@ -172,11 +183,11 @@ class Documents:
         self.table = path_of(self.header, TABLE)
 
     def members(self, name: str) -> list[str]:
-        """Return the names of the chunks of an array."""
+        """Return the names of the chunks of an array; of one of tiles, those of its index."""
         return [member for member, _ in self.parts if member.startswith(f"{name}/c/")]
 
     def values(self, member: str) -> np.ndarray[Any, Any]:
-        """Return the values of a chunk of an ordinary array."""
+        """Return the values of a chunk of an ordinary array, or of the index of one of tiles."""
         dtype = self.arrays[member[: member.rindex("/c/")]]["data_type"]
         return np.frombuffer(decompress(dict(self.parts)[member][:-4]), dtype).copy()
 
@@ -197,13 +208,13 @@ def stored(values: np.ndarray[Any, Any]) -> bytes:
 
 
 def array_of_zeros(name: str, shape: list[int], dtype: str, path: str = "") -> Parts:
-    """Return the members of an array of one chunk; key frames and positions ascend.
+    """Return the members of an array of one chunk; key frames ascend.
 
     path: in the file; the name by default.
     """
-    ascending = name.startswith(("key_frames", "coords"))
+    ascending = name == "key_frames"
     values = np.arange(prod(shape), dtype=dtype) if ascending else np.zeros(prod(shape), dtype)
-    if name.startswith("occupancy"):
+    if name == "occupancy":
         values[:] = 255
     little = {} if dtype == "uint8" else {"configuration": {"endian": "little"}}
     document = {
@@ -224,12 +235,3 @@ def array_of_zeros(name: str, shape: list[int], dtype: str, path: str = "") -> P
 def header_of(parts: Parts) -> Any:
     """Return the header of the first variable."""
     return Documents(parts).header
-
-
-def path_of(header: dict[str, Any], name: str) -> str:
-    """Return the path of an array of the first variable in a sound file."""
-    if name == TABLE:
-        return str(header.get("array", array_path(0, name)))
-    if name.startswith("coords/"):
-        return str(header["dimensions"][POSITIONS.index(name.removeprefix("coords/"))])
-    return array_path(0, name)

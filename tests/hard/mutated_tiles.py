@@ -20,20 +20,21 @@ import numpy as np
 from containers import Parts, with_crc
 from documents import (
     FLOATS,
-    OTHERS,
     Documents,
     NothingFitsError,
     hostile,
     is_plain,
     replaced,
     stored,
+    without,
 )
 from reference.sections import pack_planes
 
-from fhash_formats.container.array import ENTRY_BYTES, ArrayMetadata, Sharding, pack_index
+from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
 from fhash_formats.errors import InputError
 from fhash_formats.native import crc32c
+from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.head import INPUTS, Layer, NeighbourHead
 from fhash_formats.transform.predict import passes_of
 from fhash_formats.transform.spec import MAX_LABELS, Basis
@@ -58,47 +59,41 @@ PLAIN = TileSettings(transform=NO_TRANSFORM, step=1.0, center=0.5, low=0.0, high
 """Settings of tiles that have none."""
 CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE})
 """Features of files with coded tiles: all but those of files whose headers differ."""
+HEADED = 32
+"""Flag of settings with a head."""
 NUMBERS = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-45, 1e38, -3.4e38, 1e300, -1e308, 5e-324)
 
 
-class OneTile(Sharding):
-    """Stands for the sharding of an array of one tile, which has no shard and no index."""
-
-
-def is_sharded(document: dict[str, Any]) -> bool:
-    return bool(document["codecs"][0]["name"] == "sharding_indexed")
-
-
-def coding(document: dict[str, Any]) -> str:
-    """Return the name of the codec that makes bytes of a chunk, or of an inner chunk of a shard."""
-    first = document["codecs"][0]
-    return str((first["configuration"]["codecs"][0] if is_sharded(document) else first)["name"])
-
-
 def is_coded(document: dict[str, Any]) -> bool:
-    return coding(document) == "fhash.transform"
+    """Whether an array is one of tiles, coded by `fhash.transform`."""
+    return "tiles" in document.get("attributes", {})
 
 
-def configuration_of(document: dict[str, Any]) -> dict[str, Any]:
-    """Return the configuration of `fhash.transform`."""
-    first: dict[str, Any] = document["codecs"][0]["configuration"]
-    return first["codecs"][0]["configuration"] if is_sharded(document) else first
+def type_of(document: dict[str, Any]) -> np.dtype[Any]:
+    """Return the type of the values of an array of tiles."""
+    return np.dtype(document["attributes"]["tiles"]["data_type"])
 
 
 def tile_of(document: dict[str, Any]) -> tuple[int, ...]:
     """Return the shape of a coded tile."""
-    place = document["codecs"][0] if is_sharded(document) else document["chunk_grid"]
-    return tuple(place["configuration"]["chunk_shape"])
+    return tuple(document["attributes"]["tiles"]["tile"])
 
 
 def settings_of(document: dict[str, Any]) -> TileSettings | None:
-    """Return the settings that all tiles of an array share; None where each has its own."""
-    text = configuration_of(document).get("settings")
-    return None if text is None else TileSettings.from_text(text)
+    """Return the settings that all tiles of an array share; None where each has its own.
+
+    Some network stands for the MLP of the header.
+    """
+    text = document["attributes"]["tiles"].get("settings")
+    if text is None:
+        return None
+    headed = base64.b64decode(text)[0] & HEADED
+    return TileSettings.from_text(text, head_of(random.Random(0)) if headed else None)
 
 
 def put_settings(document: dict[str, Any], data: bytes) -> None:
-    configuration_of(document)["settings"] = base64.b64encode(data).decode()
+    """Put a block of settings to an array of tiles."""
+    document["attributes"]["tiles"]["settings"] = base64.b64encode(data).decode()
 
 
 def sections_of(stream: TileStream) -> list[bytes]:
@@ -130,38 +125,55 @@ def damaged(chance: random.Random, data: bytes) -> bytes:
     return chance.choice((b"\xff", b"\x00", b"\x80")) * chance.randrange(1, 3000)
 
 
-def inner_chunks(
-    document: dict[str, Any], member: str, data: bytes
-) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
-    """Return the sharding of an array, which inner chunks a shard has, and these."""
-    metadata = ArrayMetadata.from_dict(document)
-    sharding = metadata.sharding
-    if sharding is None:
-        tile = metadata.chunk_shape
-        return OneTile(shard_shape=tile, chunk_shape=tile, codecs=()), np.ones(1, bool), [data]
-    shard = tuple(int(i) for i in member[member.rindex("/c/") + 3 :].split("/"))
-    present = sharding.present(shard, metadata.shape)
-    index = np.frombuffer(data[-4 - present.size * ENTRY_BYTES : -4], "<u8").reshape(-1, 2)
-    places = index[present].tolist()
-    return sharding, present, [data[offset : offset + size] for offset, size in places]
+class Tiles:
+    """The tiles of an array of a sound file.
+
+    Attributes:
+        metadata: of the array.
+        members: index of each member in the grid of them.
+    """
+
+    def __init__(self, file: Documents, name: str) -> None:
+        self._file, self._name = file, name
+        self.metadata = ArrayMetadata.from_dict(file.arrays[name])
+        self.members = list(np.ndindex(*self.metadata.members))
+
+    def index_name(self, member: Sequence[int]) -> str:
+        """Return the name of the chunk of the index of a member."""
+        return f"{self._name}/c/{'/'.join(map(str, member))}"
+
+    def streams(self, member: tuple[int, ...]) -> dict[tuple[int, ...], bytes]:
+        """Return the streams of a member by the places of their tiles in the grid."""
+        data = dict(self._file.parts)[f"{self._name}/{self.metadata.member_name(member)}"]
+        places = list(self.metadata.chunks_of(member))
+        if not self.metadata.indexed:
+            return {places[0]: data}
+        shape = self.metadata.together
+        assert shape is not None
+        index = self._file.values(self.index_name(member)).reshape(shape)
+        within = zip(*places, strict=True)
+        sizes = index[tuple(np.array(n) % k for n, k in zip(within, shape, strict=True))]
+        ends = np.cumsum(sizes).tolist()
+        return {
+            place: data[end - size : end]
+            for place, end, size in zip(places, ends, sizes.tolist(), strict=True)
+        }
+
+    def packed(self, member: tuple[int, ...], streams: Sequence[bytes]) -> dict[str, bytes]:
+        """Return the data of a member of other streams, and the chunk of its index."""
+        found = {f"{self._name}/{self.metadata.member_name(member)}": b"".join(streams)}
+        if self.metadata.indexed:
+            sizes = [len(stream) for stream in streams]
+            found[self.index_name(member)] = self.metadata.index_chunk(member, sizes)
+        return found
 
 
-def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: Sequence[bytes]) -> bytes:
-    index = pack_index([len(chunk) for chunk in chunks], present)
-    return b"".join(chunks) + (b"" if isinstance(sharding, OneTile) else index)
-
-
-def _member(chance: random.Random, file: Documents, coded: bool | None) -> tuple[str, str]:
-    """Choose an array, coded by `fhash.transform` or by ordinary codecs, and one of its chunks."""
-    fitting = [
-        (name, member)
-        for name, document in file.arrays.items()
-        if coded is None or is_coded(document) == coded
-        for member in file.members(name)
-    ]
-    if not fitting:
+def _coded(chance: random.Random, file: Documents) -> str:
+    """Choose an array of tiles."""
+    names = [name for name, document in file.arrays.items() if is_coded(document)]
+    if not names:
         raise NothingFitsError
-    return chance.choice(fitting)
+    return chance.choice(names)
 
 
 Stream = Callable[[random.Random, bytes, dict[str, Any]], bytes]
@@ -175,16 +187,17 @@ def _tile(
 
     def changed(chance: random.Random, parts: Parts) -> Parts:
         file, found = Documents(parts), []
-        for name, document in file.arrays.items():
-            for member in file.members(name) if is_coded(document) else ():
-                parsed = inner_chunks(document, member, dict(parts)[member])
-                numbers = [n for n, chunk in enumerate(parsed[2]) if fits(chunk)]
-                found += [(member, document, parsed, number) for number in numbers]
+        for name in filter(lambda name: is_coded(file.arrays[name]), file.arrays):
+            tiles = Tiles(file, name)
+            for member in tiles.members:
+                streams = list(tiles.streams(member).values())
+                numbers = [n for n, stream in enumerate(streams) if fits(stream)]
+                found += [(name, tiles, member, streams, number) for number in numbers]
         if not found:
             raise NothingFitsError
-        member, document, (sharding, present, chunks), number = chance.choice(found)
-        chunks[number] = change(chance, chunks[number], document)
-        return replaced(parts, {member: shard_of(sharding, present, chunks)})
+        name, tiles, member, streams, number = chance.choice(found)
+        streams[number] = change(chance, streams[number], file.arrays[name])
+        return replaced(parts, tiles.packed(member, streams))
 
     return changed
 
@@ -216,29 +229,106 @@ def _flags(chance: random.Random, stream: bytes, document: dict[str, Any]) -> by
 def _bytes(chance: random.Random, parts: Parts) -> Parts:
     """Change bytes of a chunk as stored, with a correct checksum."""
     file = Documents(parts)
-    name, member = _member(chance, file, None)
-    if is_coded(file.arrays[name]):
+    name = chance.choice(list(file.arrays))
+    members = file.members(name)
+    if is_coded(file.arrays[name]) and (not members or chance.random() < 0.8):
         return _tile(lambda chance, stream, _: sealed(damaged(chance, stream[4:])))(chance, parts)
+    member = chance.choice(members)
     return replaced(parts, {member: with_crc(damaged(chance, dict(parts)[member][:-4]))})
 
 
 def _index(chance: random.Random, parts: Parts) -> Parts:
-    """Change the index of a shard: entries overlap, point into the index, or lie outside or are
-    missing."""
+    """Change the index of tiles: sums that do not fill the member, bytes of tiles that are none,
+    another type, shape or grid, missing and further chunks."""
     file = Documents(parts)
-    name, member = _member(chance, file, True)
-    if not is_sharded(file.arrays[name]):
+    names = [name for name, document in file.arrays.items() if is_coded(document)]
+    names = [name for name in names if file.members(name)]
+    if not names:
         raise NothingFitsError
-    data = dict(parts)[member]
-    _, present, _ = inner_chunks(file.arrays[name], member, data)
-    start = len(data) - present.size * ENTRY_BYTES - 4
-    table = list(struct.unpack(f"<{(len(data) - start - 4) // 8}Q", data[start:-4]))
-    for _ in range(chance.choice((1, 1, 2))):
-        at = chance.randrange(len(table))
-        others = (0, 1, start, start + 1, 2**64 - 1, 2**63, 2**32, max(table[at], 1) - 1)
-        table[at] = chance.choice((*others, chance.choice(table)))
-    index = with_crc(struct.pack(f"<{len(table)}Q", *table))
-    return replaced(parts, {member: data[:start] + index})
+    name = chance.choice(names)
+    document, member = file.arrays[name], chance.choice(file.members(name))
+    values, turn = file.values(member), chance.randrange(10)
+    grid = document["chunk_grid"]["configuration"]
+    if turn < 5:
+        for _ in range(chance.choice((1, 1, 2))):
+            a, b = chance.randrange(values.size), chance.randrange(values.size)
+            moved = chance.choice((1, int(values[a]), int(values[a]) // 2))
+            if chance.random() < 0.5:  # from one tile to another, so that the sum stays
+                values[a], values[b] = int(values[a]) - moved, int(values[b]) + moved
+            else:
+                others = (0, 1, 4, 5, values.sum(), values[a] + 1, values[b], 2**31, 2**32 - 1)
+                values[a] = chance.choice(others)
+        return replaced(parts, {member: stored(values)})
+    if turn == 5:  # another type
+        kind = document["data_type"] = chance.choice(list(DTYPES))
+        return file.packed({member: stored(values.astype(kind))})
+    if turn == 6:  # more or fewer tiles in a member, some of which are none
+        axis = chance.randrange(len(grid["chunk_shape"]))
+        old = values.reshape(grid["chunk_shape"])
+        more = chance.choice((1, 1, 3, 1000))
+        grid["chunk_shape"][axis] += more
+        padding = np.pad(old, [(0, more * (a == axis)) for a in range(old.ndim)])
+        if chance.random() < 0.4:
+            padding[(-1,) * old.ndim] = chance.choice((1, 5, 2**32 - 1))
+        return file.packed({member: stored(padding)})
+    if turn == 7:
+        lengths = chance.choice((document["shape"], grid["chunk_shape"]))
+        at = chance.randrange(len(lengths))
+        lengths[at] = chance.choice((1, lengths[at] + 1, 2 * lengths[at], 2**20, 2**32, 2**62))
+        return file.packed()
+    if turn == 8:  # none, or another one
+        kept = [item for item in parts if item[0] != member]
+        other = f"{name}/c/{chance.choice(('0', '0/0/0/1', '1/0/0/0', '0/0/0/0/0', '0/0/0/00'))}"
+        return [*([] if chance.random() < 0.5 else [(other, dict(parts)[member])]), *kept]
+    sizes = chance.choice((values[:-1], np.append(values, 0), values[:0], values[::-1].copy()))
+    return replaced(parts, {member: stored(sizes.astype(values.dtype))})
+
+
+NUMBERED = (
+    *("t/00", "t/01", "t/", "t", "t/-1", "t/0/0", "t/0x0", "t/ 0", "T/0", "t/1.0", "c/0", "t/c/0"),
+    *(f"t/{number}" for number in (1, 2, 7, 2**31, 2**32, 2**63, 2**63 + 1, 2**64, 10**19 - 1)),
+)
+"""Names of members of tiles, most of them of none."""
+
+
+def _members(chance: random.Random, parts: Parts) -> Parts:
+    """Rename, repeat, drop, cut or lengthen a member of tiles, or put one to another array."""
+    file = Documents(parts)
+    name, turn = _coded(chance, file), chance.randrange(6)
+    at = chance.choice([at for at, item in enumerate(parts) if item[0].startswith(f"{name}/t/")])
+    member, data = parts[at]
+    other = f"{name}/{chance.choice(NUMBERED)}"
+    if turn == 0:
+        changed = [(other, data)]
+    elif turn == 1:
+        changed = [(member, data), (other, chance.choice((data, b"", data[:5])))]
+    elif turn == 2:
+        changed = [(member, data), (f"{chance.choice(list(file.arrays))}/t/0", data)]
+    elif turn == 3:
+        changed = [(f"{name}/c/{'/'.join('0' * len(tile_of(file.arrays[name])))}", data)]
+    elif turn == 4:
+        changed = []
+    else:
+        changed = [(member, chance.choice((b"", data[:-1], data + b"\0", data[:5], data * 2)))]
+    return [*parts[:at], *changed, *parts[at + 1 :]]
+
+
+def _together(chance: random.Random, parts: Parts) -> Parts:
+    """Lay the tiles of an array into other members. The file is sound."""
+    file = Documents(parts)
+    name = _coded(chance, file)
+    tiles = Tiles(file, name)
+    streams = {
+        place: stream for member in tiles.members for place, stream in tiles.streams(member).items()
+    }
+    document, grid = file.arrays[name], tiles.metadata.grid
+    counts = [chance.choice((1, 2, n, n + 1, 3 * n)) for n in grid]
+    document["chunk_grid"]["configuration"]["chunk_shape"] = counts
+    other, new = Tiles(file, name), {}
+    for member in other.members:
+        new |= other.packed(member, [streams[i] for i in other.metadata.chunks_of(member)])
+    rest = without(file.packed(), f"{name}/c/", f"{name}/t/")
+    return [*new.items(), *rest]
 
 
 def _settings(chance: random.Random, parts: Parts) -> Parts:
@@ -248,22 +338,25 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
     if not coded:
         raise NothingFitsError
     document = chance.choice(coded)
-    put_settings(document, _other_block(chance, settings_of(document) or PLAIN, tile_of(document)))
+    settings, apart = settings_of(document) or PLAIN, chance.random() < 0.9
+    put_settings(document, _other_block(chance, settings, tile_of(document), apart=apart))
     if chance.random() < 0.1:
-        configuration = configuration_of(document)
-        configuration["settings"] = hostile(chance, configuration["settings"])
+        tiles = document["attributes"]["tiles"]
+        tiles["settings"] = hostile(chance, tiles["settings"])
     file.top["required_features"] = CODED_FEATURES
     return file.packed()
 
 
-def _other_block(chance: random.Random, settings: TileSettings, shape: tuple[int, ...]) -> bytes:
-    """Return a block of other settings, most of them not allowed."""
+def _other_block(
+    chance: random.Random, settings: TileSettings, shape: tuple[int, ...], *, apart: bool = False
+) -> bytes:
+    """Return a block of other settings, most of them not allowed. apart: without a head."""
     if chance.random() < 0.2:
-        return damaged(chance, settings.to_bytes())
+        return damaged(chance, settings.to_bytes(apart=apart))
     try:
-        return unchecked(settings, **_other(chance, settings, shape)).to_bytes()
+        return unchecked(settings, **_other(chance, settings, shape)).to_bytes(apart=apart)
     except (InputError, OverflowError, ValueError, struct.error):  # no such block
-        return damaged(chance, settings.to_bytes())
+        return damaged(chance, settings.to_bytes(apart=apart))
 
 
 def unchecked(settings: TileSettings, **values: Any) -> TileSettings:
@@ -297,7 +390,7 @@ def _other(chance: random.Random, settings: TileSettings, shape: tuple[int, ...]
         axes[chance.randrange(4)] = axis
         return {"transform": SimpleNamespace(axes=tuple(axes))}
     if turn == 4:
-        return {"head": _head(chance)}
+        return {"head": _packed(chance, head_of(chance).to_bytes())}
     if turn == 5:
         some = chance.choices((*numbers, -1.0, 0.0, 0.25, 0.5, 0.75), k=chance.randrange(16))
         scores, others = (
@@ -334,8 +427,8 @@ def _basis(chance: random.Random, shape: tuple[int, ...]) -> Any:
     return _packed(chance, packed)
 
 
-def _head(chance: random.Random) -> Any:
-    """Return a packed head with extreme numbers."""
+def head_of(chance: random.Random) -> NeighbourHead:
+    """Return a head with extreme numbers."""
     hidden = [chance.choice((1, 3, 14)) for _ in range(chance.randrange(1, 4))]
     rng = np.random.default_rng(chance.getrandbits(32))
     scales = (6.0e-8, 0.001, 1.0, 65504.0)
@@ -352,8 +445,7 @@ def _head(chance: random.Random) -> Any:
     low, high, sigma = map(
         float, np.float32([*ends, chance.choice((2.0**-100, 1e-6, 1.0, 2.0**100))])
     )
-    head = NeighbourHead(layers=layers, sigma=sigma, low=low, high=high)
-    return _packed(chance, head.to_bytes())
+    return NeighbourHead(layers=layers, sigma=sigma, low=low, high=high)
 
 
 def _predictor(chance: random.Random) -> Any:
@@ -375,7 +467,7 @@ def _predictor(chance: random.Random) -> Any:
 def _labels(chance: random.Random, stream: bytes, document: dict[str, Any]) -> bytes:
     """Change the palette, the labels or the flags of a tile of labels: a valid one, unless a
     decoder refuses it."""
-    dtype = np.dtype(document["data_type"])
+    dtype = type_of(document)
     sections, flags = sections_of(parse_stream(stream)), stream[4]
     size, rest = read_varint(memoryview(sections[-1]))
     length, rest = read_varint(rest)
@@ -464,7 +556,7 @@ def _clip(chance: random.Random, parts: Parts) -> Parts:
         file.top["format_version"] = chance.choice(([1, 8], [2, 1], [2, 2], [3, 0]))
         values = {"double": chance.random() < 0.5}
     try:
-        put_settings(document, unchecked(settings, **values).to_bytes())
+        put_settings(document, unchecked(settings, **values).to_bytes(apart=True))
     except (InputError, OverflowError, ValueError) as error:  # whole ends have no fractions
         raise NothingFitsError from error
     return file.packed()
@@ -490,8 +582,8 @@ def _changed(chance: random.Random, values: np.ndarray[Any, Any]) -> None:
 def _values(
     *beginnings: str, fits: Callable[[Documents], bool] = lambda file: True
 ) -> Callable[[random.Random, Parts], Parts]:
-    """Return a mutation of values of ordinary arrays: coordinates, weights, tables, occupancy, sums
-    of errors. beginnings: of their paths."""
+    """Return a mutation of values of ordinary arrays: weights, tables, occupancy, sums of errors.
+    beginnings: of their paths."""
 
     def changed(chance: random.Random, parts: Parts) -> Parts:
         file = Documents(parts)
@@ -515,28 +607,18 @@ def _values(
     return changed
 
 
-CORRECTIONS = "parts/0.corrections"
-ERRORS = "parts/0.steps.errors"
-OCCUPANCY = "parts/0.occupancy."
-"""Paths of the corrections of a plain file, of sums of errors, and beginning of those of
-occupancy."""
+CORRECTIONS = "corrections"
+ERRORS = "step_errors"
+OCCUPANCY = "occupancy"
+"""Paths of the corrections of a plain file, of sums of errors and of occupancy."""
 
 
 def _numbers(chance: random.Random, parts: Parts) -> Parts:
-    """Change numbers of a plain file: tables, corrections, weights, biases, their units and
-    types."""
+    """Change numbers of a plain file: tables and corrections, and the type of these."""
     file = Documents(parts)
     if not is_plain(file):
         raise NothingFitsError
-    turn = chance.random()
-    scaled = [each for each in file.arrays.values() if "scale" in each.get("attributes", {})]
-    if turn < 0.25 and scaled:
-        attributes = chance.choice(scaled)["attributes"]
-        scale = attributes["scale"]
-        others = (0, scale / 2, scale * 2, scale / 3, -scale)
-        attributes["scale"] = chance.choice((*FLOATS, *OTHERS[:6], *others))
-        return file.packed()
-    if turn < 0.4 and CORRECTIONS in file.arrays:
+    if chance.random() < 0.25 and CORRECTIONS in file.arrays:
         if chance.random() < 0.5:
             return [item for item in parts if not item[0].startswith(f"{CORRECTIONS}/")]
         kind = chance.choice(("float32", "float64", "int32", "float16", "uint8"))
@@ -547,26 +629,20 @@ def _numbers(chance: random.Random, parts: Parts) -> Parts:
         document["data_type"] = kind
         document["codecs"][0]["configuration"] = {} if kind == "uint8" else {"endian": "little"}
         return file.packed(new)
-    return _values("parts/0.mlp.", "parts/0.tables.", CORRECTIONS)(chance, parts)
+    return _values("tables/", CORRECTIONS)(chance, parts)
 
 
 def _occupancy(chance: random.Random, parts: Parts) -> Parts:
-    """Change which vertices are in the coreset, in any of the arrays that say so."""
-    file = Documents(parts)
-    names = [name for name in file.arrays if name.startswith(OCCUPANCY)]
-    if not names:
+    """Change which vertices are in the coreset, in the array that says so."""
+    file, name = Documents(parts), OCCUPANCY
+    if name not in file.arrays:
         raise NothingFitsError
-    name, turn = chance.choice(names), chance.randrange(7)
-    if turn == 0:  # under another name, or beside itself
-        other = chance.choice(("bits", "mask", "feature_1", "feature_2", "feature_3", "feature_9"))
-        keep = chance.random() < 0.5
-        kept = [item for item in parts if keep or not item[0].startswith(f"{name}/")]
-        renamed = [
-            (f"{OCCUPANCY}{other}/{member.removeprefix(f'{name}/')}", data)
-            for member, data in parts
-            if member.startswith(f"{name}/")
-        ]
-        return [*{**dict(kept[:-1]), **dict(renamed)}.items(), kept[-1]]
+    turn = chance.randrange(7)
+    if turn == 0:  # another block, or none
+        old, block = file.arrays[name].get("attributes", {}), (1, 2, 3, 64, 2**40, 0, -1, 1.0, None)
+        changed = {**old, "block": chance.choice(block)} if chance.random() < 0.7 else {}
+        file.arrays[name]["attributes"] = changed
+        return file.packed()
     if turn == 1:  # gone
         return [item for item in parts if not item[0].startswith(f"{name}/")]
     if turn == 2:
@@ -597,6 +673,8 @@ KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
     "bytes": _bytes,
     "stream": _tile(_stream),
     "index": _index,
+    "members": _members,
+    "together": _together,
     "values": _values(),
     "flags": _tile(_flags),
     "settings": _settings,

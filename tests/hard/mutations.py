@@ -7,8 +7,6 @@ reaches the code behind them. A sealed file may even be sound.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +18,7 @@ import mutated_giants
 import mutated_tiles
 import mutated_zip
 from containers import Parts, pack, unpack
-from documents import DOCUMENT, Documents, NothingFitsError, dumped, replaced
+from documents import Documents, NothingFitsError
 
 GOLDENS = Path(__file__).parents[1] / "golden"
 NEWEST = (
@@ -159,36 +157,8 @@ DAMAGES: dict[str, Callable[[random.Random, bytes], bytes]] = {
 def _packed(
     change: Callable[[random.Random, Parts], Parts],
 ) -> Callable[[random.Random, Parts], bytes]:
-    """Return a change of members as a change of the file.
-
-    Mostly the copies of documents in the root of a file of several variables are changed, too.
-    """
-
-    def changed(chance: random.Random, parts: Parts) -> bytes:
-        after = change(chance, parts)
-        with contextlib.suppress(ValueError, KeyError, RecursionError, TypeError):
-            if chance.random() < 0.85:
-                after = _consolidated(after)
-        return pack(after)
-
-    return changed
-
-
-def _consolidated(parts: Parts) -> Parts:
-    """Return the file with the documents as they are in its consolidated metadata."""
-    root = json.loads(dict(parts)[DOCUMENT])
-    if "consolidated_metadata" not in root:
-        return parts
-    root["consolidated_metadata"] = {
-        "kind": "inline",
-        "must_understand": False,
-        "metadata": {
-            name.removesuffix(f"/{DOCUMENT}"): json.loads(data)
-            for name, data in parts
-            if name.endswith(f"/{DOCUMENT}")
-        },
-    }
-    return replaced(parts, {DOCUMENT: dumped(root)})
+    """Return a change of members as a change of the file."""
+    return lambda chance, parts: pack(change(chance, parts))
 
 
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
@@ -203,9 +173,11 @@ KINDS = (*DAMAGES, *SEALED)
 PLAIN_KINDS = frozenset(("plain", "plain numbers", "plain giant", "occupancy"))
 """Kinds that change plain files, or arrays of occupancy, only."""
 PARTIAL = PLAIN_KINDS | {
-    *("sparse", "sparse giant", "consolidated", "source", "source giant"),
-    *("part", "errors", "grown", "index"),
+    *("sparse", "sparse giant", "source", "source giant"),
+    *("part", "errors", "grown", "index", "mlp"),
 }
 """Kinds that pass over goldens without what they change."""
+SAME = frozenset(("together",))
+"""Kinds of sealed files that hold what their golden does."""
 OF_ONE = PLAIN_KINDS | {"length", "giant", "clip", "integers", "grown", "sparse", "sparse giant"}
 """Kinds that change files of one variable only."""

@@ -43,8 +43,8 @@ bool read_variables(Hierarchy& hierarchy, std::vector<Variable>& found, fhash_er
 // Positions along an axis, `shape[axis]` of them.
 void find_positions(const Variable& variable, int axis, double* positions);
 
-// Bytes of the occupancy of a key frame; 0 beyond 2^59.
-int64_t occupancy_bytes(const Variable& variable);
+// Bytes of the occupancy of blocks of a key frame; 0 beyond 2^59.
+int64_t occupancy_bytes(const Variable& variable, int64_t block = 1);
 
 bool check_array(const Variable& variable, const char* name, const std::vector<int64_t>& shape,
                  std::initializer_list<int32_t> types, bool required, fhash_error& error);

@@ -12,6 +12,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,11 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.reader import layer_shapes
 from fhash_formats.container.zip_file import END, Member, comment, ending, local_header
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from sharded_files import random_values, write_sharded
+from tiled_files import random_values, write_tiled
 
 
 def occupancy_bytes(box: Iterable[tuple[int, int]]) -> int:
@@ -76,20 +76,20 @@ def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
     """Random values for every array that a header asks for."""
     rng = np.random.default_rng(0)
     model, shape = header["model"], header["domain"]["shape"]
-    arrays: dict[str, np.ndarray] = {
-        f"coords/{a}": np.arange(n) * 0.5
-        for a, n in zip(("time", "z", "y", "x"), shape, strict=True)
-    }
     key_frames = model["levels"][0][0]
-    arrays["key_frames"] = np.linspace(0, shape[0] - 1, key_frames).astype(np.int64)
+    arrays: dict[str, np.ndarray] = {
+        "key_frames": np.linspace(0, shape[0] - 1, key_frames).astype(np.int64)
+    }
     for number, level in enumerate(model["levels"], start=1):
         arrays[f"tables/level_{number}"] = rng.standard_normal(
             (*level, model["embedding_size"])
         ).astype(model["tables"])
-    for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
+    inputs = len(model["levels"]) * model["embedding_size"]
+    widths = [inputs, *[model["width"]] * model["hidden_layers"], 1]
+    for number, (inputs, outputs) in enumerate(pairwise(widths), start=1):
         arrays[f"mlp/weight_{number}"] = rng.standard_normal((outputs, inputs)).astype(np.float32)
         arrays[f"mlp/bias_{number}"] = rng.standard_normal(outputs).astype(np.float32)
-    arrays["occupancy/bits"] = rng.integers(
+    arrays["occupancy"] = rng.integers(
         0,
         256,
         (len(header["features"]), key_frames, occupancy_bytes(header["feature_bounding_box"])),
@@ -108,7 +108,6 @@ def make_compact_header() -> dict[str, Any]:
         "embedding_size": 1,
         "tables": "float32",
         "parameters": 17,
-        "head": None,
     }
     header["coordinates"] = {
         "time": {"values": [0, 0.5, 2, 2.25], "attributes": {"units": "h"}},
@@ -194,13 +193,13 @@ def _end(data: bytes) -> tuple[int, int, int]:
     return count, size, offset
 
 
-def members(path: Path, array: str) -> dict[tuple[int, ...], Member]:
-    """The members of the chunks of an array by index. array: its path in the hierarchy."""
-    found, begin = {}, f"{array}/c/"
+def members(path: Path, folder: str) -> dict[tuple[int, ...], Member]:
+    """The members of chunks or tiles by index. folder: "NAME/c" or "NAME/t" of an array."""
+    found = {}
     with zipfile.ZipFile(path) as file:
         for each in file.infolist():
-            if each.filename.startswith(begin):
-                index = tuple(map(int, each.filename.removeprefix(begin).split("/")))
+            if each.filename.startswith(f"{folder}/"):
+                index = tuple(map(int, each.filename.removeprefix(f"{folder}/").split("/")))
                 found[index] = Member(
                     name=each.filename,
                     offset=each.header_offset,
@@ -240,7 +239,7 @@ def sample(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def sharded_file(tmp_path: Path, samples: type[Samples]) -> tuple[Path, np.ndarray]:
-    """Two shards of 2 x 2 inner chunks of 2 x 3, of which the last is cut; file and values."""
+def tiled_file(tmp_path: Path, samples: type[Samples]) -> tuple[Path, np.ndarray]:
+    """Two members of 2 x 2 tiles of 2 x 3, of which the last are cut; file and values."""
     values = random_values((7, 6))
-    return write_sharded(tmp_path / "a.fhz", samples, values, (2, 3), (4, 6)), values
+    return write_tiled(tmp_path / "a.fhz", samples, values, (2, 3), (2, 2)), values

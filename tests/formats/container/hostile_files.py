@@ -16,7 +16,9 @@ from fhash_formats.container import Container
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 ROOT = "zarr.json"
-DOCUMENT = "time/zarr.json"
+DOCUMENT = "mlp/bias_1/zarr.json"
+CHUNK = "mlp/bias_1/c/0"
+"""The only chunk of this array, five numbers float32."""
 METHOD = 10
 """Offsets of fields in a directory entry: this one and the next four."""
 FLAGS = 8

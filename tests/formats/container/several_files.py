@@ -10,27 +10,16 @@ from table_files import table_parts
 
 from fhash_formats.container import ContainerWriter
 
-AXES = ("time", "z", "y", "x")
-LENGTHS = (4, 3, 5, 6)
 
 
-def add_coordinates(writer: ContainerWriter, shift: float = 0.0) -> None:
-    """The coordinates of a variable; those of x are `shift` away from the usual ones."""
-    for axis, length in zip(AXES, LENGTHS, strict=True):
-        values = np.arange(length) * 0.5 + (shift if axis == "x" else 0)
-        name = {"time": "time", "x": "lon (deg)"}.get(axis, axis)
-        writer.add_whole(f"coords/{axis}", values, attributes={"units": "m", "name": name})
-
-
-def compact_header(samples: Any) -> dict[str, Any]:
-    """The header of a compact variable without described coordinates."""
-    header = {**samples.compact_header(), "required_features": ["transform"]}
-    del header["coordinates"]
+def compact_header(samples: Any, shift: float = 0.0) -> dict[str, Any]:
+    """The header of a compact variable; its positions of x are `shift` away from the usual."""
+    header: dict[str, Any] = samples.compact_header()
+    header["coordinates"] = {
+        axis: {"step": 0.5, "attributes": {"units": "m"}} for axis in ("time", "z", "y", "x")
+    }
+    header["coordinates"]["x"] |= {"start": shift, "name": "lon (deg)"}
     return header
-
-
-PLAIN_VARIABLE = {"name": "v", "units": "", "attributes": {}}
-"""A variable as `begin` takes it."""
 
 
 def write_several(path: Path, samples: Any, *, paper: bool = True) -> Path:
@@ -42,14 +31,13 @@ def write_several(path: Path, samples: Any, *, paper: bool = True) -> Path:
         writer.attributes = {"title": "four winds"}
         for name in names[:3]:
             parts = table_parts(head=name != "w", seed=len(name))
-            writer.begin({"name": "v", "units": "m s-1", "attributes": {"flag": 1}})
-            add_coordinates(writer, shift=0.25 if name == "w" else 0)
+            writer.begin()
             writer.add_whole("auxiliary/area", np.full((5, 6), float(name == "w")))
             parts.write(writer)
-            writer.finish(compact_header(samples))
+            writer.finish(compact_header(samples, shift=0.25 if name == "w" else 0.0))
         if paper:
             header = samples.header()
-            writer.begin(PLAIN_VARIABLE)
+            writer.begin()
             for array, values in samples.arrays(header).items():
                 writer.add_whole(array, values)
             writer.finish(header)

@@ -5,27 +5,37 @@ from __future__ import annotations
 import json
 import struct
 import tracemalloc
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numcodecs.zstd
 import numpy as np
 import pytest
-from hostile_files import DOCUMENT, edited, frame, put_at, read_everything, refused, replaced
+from hostile_files import (
+    CHUNK,
+    DOCUMENT,
+    edited,
+    frame,
+    put_at,
+    read_everything,
+    refused,
+    replaced,
+)
 from rarely import rarely
-from sharded_files import NAME, PATH, random_values, write_sharded
+from tiled_files import NAME, chunk_of, random_values, tiled, tiles_of, write_tiled
 
 from fhash_formats import native
-from fhash_formats.container import Container, shard_order, shard_shape
-from fhash_formats.container import array as coding
+from fhash_formats.container import Container, tiles_together
 from fhash_formats.container.array import (
-    ABSENT,
-    MAX_SHARD_CHUNKS,
-    SINGLE_SHARD_CHUNKS,
+    MAX_TOGETHER,
+    PACKAGE,
+    SINGLE_MEMBER_TILES,
+    TRANSFORM,
     ArrayMetadata,
+    PlainCoder,
     chunk_coder,
     plain_codecs,
-    sharding_codecs,
 )
 from fhash_formats.container.zip_file import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
@@ -41,7 +51,7 @@ DAMAGED = [
     ("shape", [4.0], "shape"),
     ("shape", [1] * 99, "shape"),
     ("shape", [4, 1], "axes"),
-    ("data_type", "float32", "zstd declares|asks for float64"),
+    ("data_type", "float64", "zstd declares|asks for float32"),
     ("codecs", {"a": 1}, "codecs"),
     ("codecs", ["bytes", 5], "codecs"),
     ("attributes", [1], "attributes"),
@@ -98,15 +108,25 @@ def metadata(**changes: Any) -> ArrayMetadata:
 def test_metadata_come_back_from_their_document() -> None:
     array = metadata(dimension_names=("y", None), attributes={"units": "m"})
     assert ArrayMetadata.from_dict(array.to_dict()) == array
+    tiles = replace(tiled(np.zeros((5, 7), np.float32), (2, 3), (2, 2)), attributes={"a": 1})
+    codec = {"name": TRANSFORM, "configuration": {"axes": ["y", "x"]}}
+    for one in (tiles, replace(tiles, codecs=[codec])):
+        assert ArrayMetadata.from_dict(one.to_dict()) == one
 
 
 def test_every_chunk_has_its_name_and_its_region() -> None:
-    array, values = metadata(), np.zeros((5, 7), int)
-    assert array.grid == array.inner_grid == (3, 3)
-    for index in product(*map(range, array.grid)):
-        assert array.chunk_key(index) == f"c/{index[0]}/{index[1]}"
-        values[array.inner_region(index)] += 1
-    assert np.all(values == 1)
+    array = metadata()
+    tiles = tiled(np.zeros((5, 7), np.float32), (2, 3), (2, 2))
+    assert (array.grid, array.members, array.indexed) == ((3, 3), (3, 3), False)
+    assert (tiles.grid, tiles.members, tiles.indexed) == ((3, 3), (2, 2), True)
+    for one in (array, tiles):
+        values = np.zeros((5, 7), int)
+        for number, member in enumerate(product(*map(range, one.members))):
+            named = f"t/{number}" if one is tiles else f"c/{member[0]}/{member[1]}"
+            assert one.member_name(member) == named
+            for index in one.chunks_of(member):
+                values[one.region(index)] += 1
+        assert np.all(values == 1)
 
 
 @pytest.mark.parametrize("size", [0, 7, 255, 767, 768, 769, 12287, 12288, 12289, 100_003])
@@ -145,17 +165,17 @@ def test_a_tile_that_would_take_gigabytes_is_refused() -> None:
 CHUNKS = {
     "bomb": (
         lambda right: numcodecs.zstd.compress(bytes(1 << 26), 1),
-        "zstd declares 67108864 bytes; the chunk has 32",
+        "zstd declares 67108864 bytes; the chunk has 20",
     ),
     "bomb of unknown size": (lambda right: frame(bytes(1 << 16)), "zstd declares"),
-    "bomb that lies": (lambda right: frame(bytes(1 << 16), size=32), "zstd data are damaged"),
+    "bomb that lies": (lambda right: frame(bytes(1 << 16), size=20), "zstd data are damaged"),
     "two frames": (lambda right: numcodecs.zstd.compress(right, 1) * 2, "zstd data are damaged"),
-    "fewer bytes": (lambda right: frame(right[:16], size=32), "zstd data are damaged"),
+    "fewer bytes": (lambda right: frame(right[:16], size=20), "zstd data are damaged"),
     "declares 2^63": (lambda right: frame(right, size=2**63), "zstd declares"),
     "other content": (lambda right: right, "not a zstd frame"),
     "empty": (lambda right: b"", "not a zstd frame"),
     "header only": (
-        lambda right: frame(right, size=32)[:8],
+        lambda right: frame(right, size=20)[:8],
         "not a zstd frame",
     ),
 }
@@ -164,101 +184,64 @@ CHUNKS = {
 @pytest.mark.parametrize("case", CHUNKS)
 def test_chunk_data(sample, samples, case) -> None:
     make, message = CHUNKS[case]
-    coded = make(np.arange(4, dtype="<f8").tobytes())
+    coded = make(np.arange(5, dtype="<f4").tobytes())
     coded += struct.pack("<I", crc32c(coded))
-    data = replaced(sample, samples, "time/c/0", coded)
-    refused(sample, data, f"member time/c/0: {message}")
+    data = replaced(sample, samples, CHUNK, coded)
+    refused(sample, data, f"member {CHUNK}: {message}")
 
 
 @pytest.mark.parametrize(
-    "coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"]
+    "coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(20), 1) + b"abcd"]
 )
 def test_chunk_without_its_crc(sample, samples, coded) -> None:
-    data = replaced(sample, samples, "time/c/0", coded)
-    refused(sample, data, "member time/c/0: .*CRC-32C")
+    data = replaced(sample, samples, CHUNK, coded)
+    refused(sample, data, f"member {CHUNK}: .*CRC-32C")
 
 
 def test_frame_made_by_hand_is_read(sample, samples) -> None:
     """The hostile frames above differ from this one only in what they are refused for."""
-    right = np.arange(4, dtype="<f8")
-    coded = frame(right.tobytes(), size=32)
+    right = np.arange(5, dtype="<f4")
+    coded = frame(right.tobytes(), size=20)
     coded += struct.pack("<I", crc32c(coded))
-    sample.write_bytes(replaced(sample, samples, "time/c/0", coded))
+    sample.write_bytes(replaced(sample, samples, CHUNK, coded))
     with Container.open(sample) as container:
-        np.testing.assert_array_equal(container.arrays["coords/time"].read(), right)
+        np.testing.assert_array_equal(container.arrays["mlp/bias_1"].read(), right)
 
 
-def test_bytes_of_a_shard(tmp_path, samples) -> None:
-    """A shard is its inner chunks without gaps, an index of (offset, bytes), and its CRC-32C."""
-    values = np.arange(3, dtype=np.uint8)
-    path = write_sharded(tmp_path / "a.fhz", samples, values, (2,), (6,))
-    member = samples.members(path, PATH)[0,]
-    data = path.read_bytes()[member.data_offset : member.end]
-    coder = coding.chunk_coder(coding.plain_codecs(values.dtype), values.dtype, (2,))
-    first, second = coder.encode(values[:2]), coder.encode(np.array([2, 0], np.uint8))
-    index = struct.pack("<6Q", 0, len(first), len(first), len(second), ABSENT, ABSENT)
-    assert data == first + second + index + struct.pack("<I", crc32c(index))
-
-
-@pytest.mark.parametrize(
-    ("chunk_shape", "shard_shape"),
-    [((2, 3), (4, 7)), ((1, 1), (2048, 2048))],
-)
-def test_shards_that_do_not_fit(tmp_path, samples, chunk_shape, shard_shape) -> None:
-    path = write_sharded(tmp_path / "a.fhz", samples, random_values((7, 6)), (1, 6), (7, 6))
-    parts = samples.unpack(path.read_bytes())
-    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
-    document = json.loads(parts[place][1])
-    document["chunk_grid"]["configuration"]["chunk_shape"] = shard_shape
-    document["codecs"][0]["configuration"]["chunk_shape"] = chunk_shape
-    parts[place] = parts[place][0], json.dumps(document).encode()
-    path.write_bytes(samples.pack(parts))
-    with pytest.raises(DamagedFileError, match="sharding_indexed"):
-        Container.open(path)
-
-
-BIG = 2**60
-
-
-ORDER = "the index of the shard has inner chunks that are missing, overlap"
-INDICES = {
-    "offset outside": (lambda t: t[1].__setitem__(0, BIG), ORDER),
-    "size outside": (lambda t: t[1].__setitem__(1, BIG), ORDER),
-    "sizes that overflow": (
-        lambda t: (t[0].__setitem__(1, 2**63), t[1].__setitem__(1, 2**63)),
-        ORDER,
-    ),
-    "overlap": (lambda t: t[1].__setitem__(0, 0), ORDER),
-    "two at one place": (lambda t: t.__setitem__(1, list(t[0])), ORDER),
-    "gap": (lambda t: t[1].__setitem__(1, t[1][1] - 1), ORDER),
-    "exchanged": (lambda t: t.__setitem__(slice(0, 2), [t[1], t[0]]), ORDER),
-    "missing": (lambda t: t.__setitem__(1, [ABSENT, ABSENT]), ORDER),
-    "half missing": (lambda t: t[1].__setitem__(0, ABSENT), ORDER),
-    "beyond the array": (lambda t: t.__setitem__(3, [0, 5]), ORDER),
-    "empty": (
-        lambda t: (
-            t[2].__setitem__(1, 0),
-            t[1].__setitem__(1, t[1][1] + t[2][1]),
-            t[2].__setitem__(0, t[2][0] + 10**6),
-        ),
-        ORDER,
-    ),
-}
+def test_bytes_of_members_of_tiles(tmp_path, samples) -> None:
+    """Tiles without gaps, in C order; chunks of an ordinary array of uint32 have their sizes."""
+    values = random_values((7, 6))
+    path = write_tiled(tmp_path / "a.fhz", samples, values, (2, 3), (2, 2))
+    parts = dict(samples.unpack(path.read_bytes()))
+    metadata = tiled(values, (2, 3), (2, 2))
+    padded = np.pad(values, ((0, 1), (0, 0)))
+    coded = {i: metadata.coder.encode(chunk_of(padded, i, (2, 3))) for i in tiles_of(metadata)}
+    for number in (0, 1):
+        streams = [coded[index] for index in metadata.chunks_of((number, 0))]
+        assert parts[f"{NAME}/t/{number}"] == b"".join(streams)
+        sizes = np.reshape([len(each) for each in streams], (2, 2)).astype(np.uint32)
+        coder = PlainCoder(plain_codecs(sizes.dtype), sizes.dtype, (2, 2))
+        assert parts[f"{NAME}/c/{number}/0"] == coder.encode(sizes)
+    document = json.loads(parts[f"{NAME}/zarr.json"])
+    assert (document["shape"], document["data_type"]) == ([4, 2], "uint32")
+    assert document["attributes"]["tiles"] == {
+        "codec": TRANSFORM,
+        "package": PACKAGE,
+        "shape": [7, 6],
+        "data_type": "float32",
+        "tile": [2, 3],
+    }
 
 
 @pytest.fixture
 def line(tmp_path, samples):
-    """One shard of four inner chunks, of which the last is beyond the end of the array.
-
-    Returns the file, its parts for `samples.pack`, and the number of the shard among the parts.
-    """
-    path = write_sharded(tmp_path / "a.fhz", samples, random_values((5,)), (2,), (8,))
-    parts = samples.unpack(path.read_bytes())
-    return path, parts, [name for name, _ in parts].index(f"{PATH}/c/0")
+    """One member of four tiles, of which the last is beyond the end of the array; file, parts."""
+    path = write_tiled(tmp_path / "a.fhz", samples, random_values((5,)), (2,), (4,))
+    return path, dict(samples.unpack(path.read_bytes()))
 
 
-def refused_shard(path, samples, parts, message, kind=DamagedFileError):
-    path.write_bytes(samples.pack(parts))
+def refused_tiles(path, samples, parts, message, kind=DamagedFileError) -> None:
+    path.write_bytes(samples.pack(parts.items()))
     for act in (
         lambda c: c.arrays[NAME].read(),
         lambda c: c.arrays[NAME].read((slice(2, 3),)),
@@ -274,150 +257,212 @@ def refused_shard(path, samples, parts, message, kind=DamagedFileError):
         assert "\n" not in str(caught.value)
 
 
-def test_hostile_indices(line, samples) -> None:
-    path, parts, at = line
-    name, data = parts[at]
-    for change, message in INDICES.values():
-        table = [list(entry) for entry in struct.iter_unpack("<2Q", data[-68:-4])]
-        change(table)
-        index = b"".join(struct.pack("<2Q", *entry) for entry in table)
-        changed = data[:-68] + index + struct.pack("<I", crc32c(index))
-        hostile = [*parts[:at], (name, changed), *parts[at + 1 :]]
-        refused_shard(path, samples, hostile, f"member {PATH}/c/0: .*{message}")
-
-
-@pytest.mark.parametrize("data", [b"", b"x" * 67])
-def test_shard_shorter_than_its_index(line, samples, data) -> None:
-    path, parts, at = line
-    parts[at] = parts[at][0], data
-    refused_shard(path, samples, parts, f"member {PATH}/c/0: too few bytes")
-
-
-def test_shards_that_declare_much(line, samples) -> None:
-    """A million inner chunks of a gibibyte each, in a few bytes."""
-    path, parts, _ = line
-    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
-    text = parts[place][1].decode()
-    many = text.replace('"chunk_shape":[8]', f'"chunk_shape":[{2**48}]').replace(
-        '"chunk_shape":[2]', f'"chunk_shape":[{2**28}]'
-    )
-    assert MAX_SHARD_CHUNKS == 2**20
-    parts[place] = parts[place][0], many.replace('"shape":[5]', f'"shape":[{2**48}]').encode()
-    refused_shard(path, samples, parts, "too few bytes for the index|memory")
-
-
-SETTINGS = {
-    "index at the beginning": ({"index_location": "start"}, UnsupportedFileError),
-    "index without checksum": (
-        {"index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
-        UnsupportedFileError,
-    ),
-    "another setting": ({"surprise": 1}, UnsupportedFileError),
-    "no codecs": ({"codecs": []}, UnsupportedFileError),
-    "codecs no list": ({"codecs": {"a": 1}}, DamagedFileError),
-    "inner codecs without checksum": (
-        {"codecs": coding.plain_codecs(np.dtype("f4"))[:-1]},
-        UnsupportedFileError,
-    ),
-    "shards in shards": (
-        {"codecs": sharding_codecs([1], coding.plain_codecs(np.dtype("f4")))},
-        UnsupportedFileError,
-    ),
-    "chunk no list": ({"chunk_shape": 2}, DamagedFileError),
-    "chunk of other rank": ({"chunk_shape": [2, 2]}, DamagedFileError),
-    "chunk of a fraction": ({"chunk_shape": [2.0]}, DamagedFileError),
-    "chunk of zero": ({"chunk_shape": [0]}, DamagedFileError),
-    "no divisor": ({"chunk_shape": [3]}, DamagedFileError),
+INDEX = f"{NAME}/c/0"
+SIZES = {
+    "more": lambda sizes: sizes.__setitem__(1, sizes[1] + 1),
+    "less": lambda sizes: sizes.__setitem__(2, sizes[2] - 1),
+    "much more": lambda sizes: sizes.__setitem__(0, 2**32 - 1),
+    "sum beyond 2^32": lambda sizes: sizes.__setitem__(slice(0, 3), 2**31),
+    "a tile beyond the array": lambda sizes: sizes.__setitem__(slice(2, 4), sizes[3:1:-1]),
+    "nothing": lambda sizes: sizes.fill(0),
 }
 
 
-@pytest.mark.parametrize("case", SETTINGS)
-def test_settings_that_are_refused(line, samples, case) -> None:
-    changes, kind = SETTINGS[case]
-    path, parts, _ = line
-    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
-    document = json.loads(parts[place][1])
-    document["codecs"][0]["configuration"].update(changes)
-    parts[place] = parts[place][0], json.dumps(document).encode()
-    refused_shard(path, samples, parts, f"member {PATH}/zarr.json: ", kind)
+@pytest.mark.parametrize("case", SIZES)
+def test_sizes_that_do_not_fill_their_member(line, samples, case) -> None:
+    path, parts = line
+    sizes = np.frombuffer(numcodecs.zstd.decompress(parts[INDEX][:-4]), np.uint32).copy()
+    SIZES[case](sizes)
+    parts[INDEX] = PlainCoder(plain_codecs(sizes.dtype), sizes.dtype, (4,)).encode(sizes)
+    refused_tiles(path, samples, parts, f"member {NAME}/t/0: the index of its tiles")
 
 
-@pytest.mark.parametrize(
-    "change", [lambda c: c.append({"name": "crc32c"}), lambda c: c[0].pop("configuration")]
-)
-def test_sharding_stands_alone(line, samples, change) -> None:
-    path, parts, _ = line
-    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
-    document = json.loads(parts[place][1])
-    change(document["codecs"])
-    parts[place] = parts[place][0], json.dumps(document).encode()
-    refused_shard(path, samples, parts, "sharding_indexed", UnsupportedFileError)
+def test_sizes_that_are_exchanged(line, samples) -> None:
+    """They fill the member, but a tile begins within another one."""
+    path, parts = line
+    sizes = np.frombuffer(numcodecs.zstd.decompress(parts[INDEX][:-4]), np.uint32).copy()
+    sizes[:3] += np.array([-4, 8, -4]).astype(np.uint32)
+    parts[INDEX] = PlainCoder(plain_codecs(sizes.dtype), sizes.dtype, (4,)).encode(sizes)
+    refused_tiles(path, samples, parts, f"member {NAME}/t/0: tile [01]: ")
+
+
+@pytest.mark.parametrize("data", [b"", b"abcd", b"x" * 67])
+def test_an_index_that_cannot_be_decoded(line, samples, data) -> None:
+    path, parts = line
+    parts[INDEX] = data
+    refused_tiles(path, samples, parts, f"member {INDEX}: .*CRC-32C")
+
+
+MEMBERS = {
+    "index missing": (lambda p: p.pop(INDEX), f"{NAME} has 0 chunks"),
+    "tiles missing": (lambda p: p.pop(f"{NAME}/t/0"), f"{NAME} has 0 chunks"),
+    "index twice": (lambda p: p.update({f"{NAME}/c/1": b"x"}), f"{NAME} has 2 chunks"),
+    "tiles twice": (lambda p: p.update({f"{NAME}/t/1": b"x"}), f"{NAME} has 2 chunks"),
+    "tiles of other axes": (lambda p: p.update({f"{NAME}/t/0/0": b"x"}), "belongs to no array"),
+    "tiles of another name": (lambda p: p.update({f"{NAME}/t/00": b"x"}), "belongs to no array"),
+    "tiles of numbers": (
+        lambda p: p.update({"tables/level_1/t/0": b"x"}),
+        "member tables/level_1/t/0 belongs to no array",
+    ),
+    "tiles outside": (
+        lambda p: p.update({f"{NAME}/t/1": p.pop(f"{NAME}/t/0")}),
+        f"member {NAME}/t/1 belongs to no array",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MEMBERS)
+def test_members_of_tiles_are_all_there(line, samples, case) -> None:
+    path, parts = line
+    change, message = MEMBERS[case]
+    change(parts)
+    parts["zarr.json"] = parts.pop("zarr.json")
+    refused_tiles(path, samples, parts, message)
+
+
+def test_a_tile_alone_in_its_member_has_no_index(tmp_path, samples) -> None:
+    path = write_tiled(tmp_path / "a.fhz", samples, random_values((5,)), (2,))
+    parts = dict(samples.unpack(path.read_bytes()))
+    assert [name for name in parts if name.startswith(f"{NAME}/")] == [
+        *(f"{NAME}/t/{number}" for number in range(3)),
+        f"{NAME}/zarr.json",
+    ]
+    refused_tiles(path, samples, {INDEX: b"x", **parts}, f"member {INDEX} belongs to no array")
+
+
+def changed_document(line, changes: dict[str, Any]) -> dict[str, bytes]:
+    """The parts with values at places of the document of the tiles."""
+    _, parts = line
+    document = json.loads(parts[f"{NAME}/zarr.json"])
+    for place, value in changes.items():
+        put_at(document, place, value)
+    return {**parts, f"{NAME}/zarr.json": json.dumps(document).encode()}
+
+
+CHUNK_SHAPE = "chunk_grid.configuration.chunk_shape"
+DOCUMENTS = {
+    "no object": ({"attributes.tiles": 5}, UnsupportedFileError),
+    "no codec": ({"attributes.tiles.codec": ...}, UnsupportedFileError),
+    "another codec": ({"attributes.tiles.codec": "fhash.teleport"}, UnsupportedFileError),
+    "another key": ({"attributes.tiles.surprise": 1}, UnsupportedFileError),
+    "an index of int32": ({"data_type": "int32"}, DamagedFileError),
+    "no type": ({"attributes.tiles.data_type": ...}, UnsupportedFileError),
+    "another type": ({"attributes.tiles.data_type": "complex64"}, UnsupportedFileError),
+    "no shape": ({"attributes.tiles.shape": ...}, DamagedFileError),
+    "another shape": ({"attributes.tiles.shape": [7]}, DamagedFileError),
+    "shape of two axes": ({"attributes.tiles.shape": [5, 1]}, DamagedFileError),
+    "no tile": ({"attributes.tiles.tile": ...}, DamagedFileError),
+    "tile no list": ({"attributes.tiles.tile": 2}, DamagedFileError),
+    "tile of two axes": ({"attributes.tiles.tile": [2, 2]}, DamagedFileError),
+    "tile of a fraction": ({"attributes.tiles.tile": [2.0]}, DamagedFileError),
+    "tile of zero": ({"attributes.tiles.tile": [0]}, DamagedFileError),
+    "tile of another grid": ({"attributes.tiles.tile": [3]}, DamagedFileError),
+    "tile that overflows": (
+        {"attributes.tiles.tile": [2**61], "attributes.tiles.shape": [2**62], "shape": [2]},
+        DamagedFileError,
+    ),
+    "large tile": (
+        {"attributes.tiles.tile": [2**28], "attributes.tiles.shape": [2**28], "shape": [1]},
+        DamagedFileError,
+    ),
+    "many tiles": (
+        {
+            "attributes.tiles.shape": [2**48],
+            "shape": [2**47],
+            CHUNK_SHAPE: [2 * MAX_TOGETHER],
+        },
+        DamagedFileError,
+    ),
+    "settings of no base64": ({"attributes.tiles.settings": "?"}, DamagedFileError),
+    "settings of no text": ({"attributes.tiles.settings": 5}, DamagedFileError),
+    "empty settings": ({"attributes.tiles.settings": ""}, DamagedFileError),
+    "axes no list": ({"attributes.tiles.axes": "x"}, DamagedFileError),
+    "axes too many": ({"attributes.tiles.axes": ["y", "x"]}, DamagedFileError),
+    "an axis of no name": ({"attributes.tiles.axes": ["w"]}, DamagedFileError),
+    "an axis that tiles lack": ({"attributes.tiles.axes": [""]}, DamagedFileError),
+}
+
+
+@pytest.mark.parametrize("case", DOCUMENTS)
+def test_tiles_that_are_described_wrongly(line, samples, case) -> None:
+    changes, kind = DOCUMENTS[case]
+    parts = changed_document(line, changes)
+    refused_tiles(line[0], samples, parts, f"member {NAME}/zarr.json: ", kind)
+
+
+def test_many_tiles_in_a_few_bytes(line, samples) -> None:
+    """A million tiles of 2^27 vertices; the index lacks their sizes."""
+    parts = changed_document(
+        line,
+        {
+            "attributes.tiles.tile": [2**27],
+            "attributes.tiles.shape": [2**47],
+            "shape": [MAX_TOGETHER],
+            CHUNK_SHAPE: [MAX_TOGETHER],
+        },
+    )
+    refused_tiles(line[0], samples, parts, f"member {INDEX}: zstd declares|memory")
 
 
 @pytest.mark.parametrize("part", [0, *rarely(1, 2, 3)])
-def test_every_flip_in_a_shard_is_found(sharded_file, samples, part) -> None:
-    path, _ = sharded_file
-    members = samples.members(path, PATH).values()
+def test_every_flip_in_tiles_is_found(tiled_file, samples, part) -> None:
+    path, _ = tiled_file
     sound = path.read_bytes()
-    for member in members:
+    members = [*samples.members(path, f"{NAME}/t").values()]
+    for member in [*members, *samples.members(path, f"{NAME}/c").values()]:
         for at in range(member.offset + part, member.end, 4):
             damaged = bytearray(sound)
             damaged[at] ^= 4
             path.write_bytes(damaged)
             with (
-                pytest.raises(DamagedFileError, match=f"member {PATH}/c/"),
+                pytest.raises(DamagedFileError, match=f"member {NAME}/[ct]/"),
                 Container.open(path) as container,
             ):
                 container.verify()
-            if at >= member.data_offset:
+            if at >= member.data_offset or member not in members:
                 with (
-                    pytest.raises(DamagedFileError, match=f"member {PATH}/c/"),
+                    pytest.raises(DamagedFileError, match=f"member {NAME}/[ct]/"),
                     Container.open(path) as container,
                 ):
                     container.arrays[NAME].read()
 
 
 @pytest.mark.parametrize(
-    ("grid", "shards"),
+    ("grid", "together"),
     [
         ((1, 1, 1, 1), (1, 1, 1, 1)),
-        ((4, 32, 32, 1), (1, 1, 1, 1)),
-        ((SINGLE_SHARD_CHUNKS + 1, 1, 1, 1), (SINGLE_SHARD_CHUNKS + 1, 1, 1, 1)),
-        ((3, 32, 32, 2), (3, 1, 1, 1)),
+        ((4, 32, 32, 1), (4, 32, 32, 1)),
+        ((SINGLE_MEMBER_TILES + 1, 1, 1, 1), (1, 1, 1, 1)),
+        ((3, 32, 32, 2), (1, 32, 32, 2)),
     ],
 )
-def test_a_large_array_has_a_shard_for_each_layer(grid, shards) -> None:
-    chunk_shape = (2, 3, 5, 7)
-    shape = shard_shape(chunk_shape, grid)
-    assert all(n % chunk == 0 for n, chunk in zip(shape, chunk_shape, strict=True))
-    lengths = [n * chunk for n, chunk in zip(grid, chunk_shape, strict=True)]
-    assert tuple(-(-n // shard) for n, shard in zip(lengths, shape, strict=True)) == shards
+def test_a_large_array_has_a_member_for_each_layer(grid, together) -> None:
+    assert tiles_together(grid) == together
 
 
 @pytest.mark.parametrize(
-    ("grid", "largest", "counts"),
+    ("grid", "largest", "together"),
     [
         ((4, 3, 5, 2), 1 << 20, (4, 3, 5, 2)),  # 120 MiB fit
         ((4, 3, 5, 2), 1 << 25, (2, 3, 5, 2)),  # 3.8 GiB: half of the steps
         ((4, 3, 5, 2), 1 << 27, (1, 1, 5, 2)),  # 15 GiB: a third of a layer, 1.3 GiB
         ((4, 3, 5, 2), 1 << 29, (1, 1, 2, 2)),
         ((4, 3, 5, 2), MAX_MEMBER // 2, (1, 1, 1, 2)),
-        ((4, 3, 5, 2), MAX_MEMBER, (1, 1, 1, 1)),  # no shard can hold such a tile
+        ((4, 3, 5, 2), MAX_MEMBER, (1, 1, 1, 1)),  # no member can hold such a tile
         ((2, 1 << 7, 1 << 7, 1 << 7), 1, (1, 1 << 6, 1 << 7, 1 << 7)),  # 2^20 tiles
     ],
 )
-def test_shards_stay_within_the_limits(grid, largest, counts) -> None:
-    sizes = np.ones(np.prod(grid), np.int64)
-    sizes[:] = largest - 64 if grid[0] == 4 else largest
-    assert shard_shape((1, 2, 3, 4), grid, sizes) == tuple(np.multiply((1, 2, 3, 4), counts))
-    order = shard_order(grid, (1, 1, 1, 1), counts)
+def test_members_stay_within_the_limits(grid, largest, together) -> None:
+    sizes = np.full(np.prod(grid), largest, np.int64)
+    assert tiles_together(grid, sizes) == together
     if grid[0] == 4:
-        assert list(order) == list(product(*map(range, grid)))
+        order = tiles_of(tiled(np.zeros(grid, np.float32), (1, 1, 1, 1), together))
+        assert order == list(product(*map(range, grid)))
 
 
-def test_the_largest_shard_decides() -> None:
+def test_the_largest_member_decides() -> None:
     sizes = np.ones((4, 2, 1, 1), np.int64)
     sizes[2] = MAX_MEMBER // 2 - 100
-    assert shard_shape((1, 1, 1, 1), sizes.shape, sizes.ravel()) == (4, 2, 1, 1)
+    assert tiles_together(sizes.shape, sizes.ravel()) == (4, 2, 1, 1)
     sizes[3, 0] = 1000
-    assert shard_shape((1, 1, 1, 1), sizes.shape, sizes.ravel()) == (1, 2, 1, 1)
+    assert tiles_together(sizes.shape, sizes.ravel()) == (1, 2, 1, 1)

@@ -271,6 +271,20 @@ bool read_mlp(Variable& variable, fhash_error& error) {
            fail_in(error, "header key mlp");
 }
 
+// Checks the bits of blocks of vertices, beside tiles that have the exact masks.
+bool check_blocks(const Variable& variable, fhash_error& error) {
+    const Array* const array = variable.find("occupancy");
+    if (!array) return true;
+    const Record attributes = {array->attributes, "array occupancy attribute "};
+    int64_t block = 1;
+    if (attributes.find("block") &&
+        !attributes.integer("block", 1, int64_t(1) << 40, block, error))
+        return false;
+    const std::vector<int64_t> bits = {1, variable.keys(), occupancy_bytes(variable, block)};
+    return attributes.need((block & (block - 1)) == 0, "block", "a power of two", error) &&
+           check_array(variable, "occupancy", bits, {FHASH_UINT8}, false, error);
+}
+
 // Checks the arrays that both profiles, and the profile compact, are read from.
 bool check_arrays(const Variable& variable, fhash_error& error) {
     const auto& level = variable.levels[0];
@@ -284,7 +298,8 @@ bool check_arrays(const Variable& variable, fhash_error& error) {
         return false;
     const std::vector<int64_t> lengths(level.begin(), level.end());
     if (variable.compact && !variable.plain) {
-        if (!check_array(variable, "tables/level_1", lengths, {variable.values}, true, error))
+        if (!check_array(variable, "tables/level_1", lengths, {variable.values}, true, error) ||
+            !check_blocks(variable, error))
             return false;
     } else {
         const int64_t features = variable.compact ? 1 : variable.features;
@@ -514,10 +529,10 @@ void find_positions(const Variable& variable, int axis, double* positions) {
     }
 }
 
-int64_t occupancy_bytes(const Variable& variable) {
+int64_t occupancy_bytes(const Variable& variable, int64_t block) {
     int width = 0;
     for (int a = 0; a < 3; a++)
-        for (int64_t rest = variable.length(a) - 1; rest > 0; rest >>= 1) width++;
+        for (int64_t rest = (variable.length(a) - 1) / block; rest > 0; rest >>= 1) width++;
     return width < 62 ? ((int64_t(1) << width) + 7) / 8 : 0;
 }
 
