@@ -114,10 +114,9 @@ class FileInfo(TypedDict):
     training: Annotated[dict[str, Any], "seconds, epochs, device and more"]
     history: Annotated[list[HistoryPoint], "course of the training"]
     quality: Annotated[FileQuality, "figures of the quality"]
-    array: NotRequired[Annotated[str, "path of the array of the values, where one shows them"]]
+    group: NotRequired[Annotated[str, "group of its arrays, of a variable among several"]]
     shares: NotRequired[Annotated[dict[str, Any], "arrays that are those of another variable"]]
     part: NotRequired[Annotated[dict[str, Any], "of a series that is encoded in parts"]]
-    dimensions: Annotated[list[str], "names of the axes at the root, (t, z, y, x)"]
     arrays: Annotated[dict[str, ArrayOfFile], "arrays of the file by path"]
 
 

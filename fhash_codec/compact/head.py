@@ -53,10 +53,10 @@ GAIN_OF_MLP = 1.6
 """Gain of the narrowest as a multiple of that of least squares: 1.6 to 1.9 on three series."""
 MOST_EXCESS = 6.0
 """dB above the promise that an MLP is credited with at most, since no such step was tried."""
-WEIGHT_BYTES = 0.7
-"""Bytes that each weight adds to the file."""
-MLP_BYTES = 60
-"""Bytes that an MLP adds to the file besides its weights: its history and description."""
+MLP_BYTES = 110
+"""Approximate bytes of an MLP in the deflated header beside its numbers."""
+WEIGHT_BYTES, BIAS_BYTES = 0.6875, 2.5
+"""Approximate bytes of a number there."""
 TRAINING_NS = 0.12
 """Nanoseconds of a product in training."""
 JOINT = 1.2
@@ -173,7 +173,11 @@ class _Pass(NamedTuple):
 
 def head_bytes(head: NeighbourHead | None) -> int:
     """Return the bytes that an MLP adds to the file; 0 without one."""
-    return 0 if head is None else len(head.to_bytes()) + MLP_BYTES
+    if head is None:
+        return 0
+    biases = sum(layer.biases.size for layer in head.layers)
+    weights = head.size - biases
+    return MLP_BYTES + math.ceil(WEIGHT_BYTES * weights + BIAS_BYTES * biases)
 
 
 def choose_head(

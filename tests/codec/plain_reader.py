@@ -30,7 +30,7 @@ def shifted(values, offset):
 
 def corrected(tile, layers, head):
     """A tile (t, z, y, x) of the table, corrected by the head; float32."""
-    low, high, sigma = (f4(head[key]) for key in ("low", "high", "sigma"))
+    low, high, sigma = map(f4, (*head["range"], head["sigma"]))
     tile, half = np.clip(tile, low, high), f4(0.5) / sigma
 
     def squeezed(difference):
@@ -42,12 +42,26 @@ def corrected(tile, layers, head):
     inputs.append(np.floor(np.minimum((tile - low) * unit + f4(0.5), 1024)) - 512)
     inputs.append(squeezed(tile - low))
     for number, (weight, bias, scale) in enumerate(layers):
-        sums = np.tensordot(np.rint(weight / scale), np.array(inputs, "f8"), 1).astype("f4")
+        sums = np.tensordot(weight, np.array(inputs, "f8"), 1).astype("f4")
         last, unit_in = number == len(layers) - 1, 128 if number else 512
         unit_out = sigma if last else f4(128)
         out = sums * (f4(scale / unit_in) * unit_out) + (bias * unit_out)[:, None, None, None, None]
         inputs = np.rint(np.clip(np.where(out > 0, out, out / 8), -4095, 4095))
     return np.clip(tile + out[0], low, high)
+
+
+def layers_of(mlp):
+    """Whole weights, biases and the scale of the weights of each layer of an MLP in a header."""
+    alphabet = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+"
+    weights = np.array([alphabet.index(letter) - 31 for letter in mlp["weights"]], "f8")
+    biases, scales = np.array(mlp["biases"], "f4"), np.array(mlp["scales"], "f2").astype("f4")
+    inputs, at, place, layers = 28, 0, 0, []
+    for number, width in enumerate([*mlp["widths"], 1]):
+        matrix = weights[at : at + width * inputs].reshape(width, inputs)
+        shift = biases[place : place + width] * scales[2 * number + 1]
+        layers.append((matrix, shift, float(scales[2 * number])))
+        at, place, inputs = at + width * inputs, place + width, width
+    return layers
 
 
 def interpolated(table, lengths, at):
@@ -65,17 +79,15 @@ def interpolated(table, lengths, at):
 def values(path, key):
     """Values (z, y, x) of the box at a key frame, float64; NaN outside the coreset."""
     root = zarr.open_group(zarr.storage.ZipStore(path, mode="r"), mode="r")
-    (header,), parts = root.attrs["fhash"]["variables"], root["parts"]
-    model, (low, high) = header["model"], header["value_range"]
-    lengths, layers = model["levels"][0], []
-    while f"0.mlp.weight_{len(layers) + 1}" in parts:
-        weight, bias = (parts[f"0.mlp.{kind}_{len(layers) + 1}"] for kind in ("weight", "bias"))
-        layers.append((weight[...].astype("f8"), bias[...], weight.attrs.get("scale")))
-    tables = [parts[f"0.tables.level_{n + 1}"] for n in range(len(model["levels"]))]
+    (header,) = root.attrs["fhash"]["variables"]
+    model, (low, high), mlp = header["model"], header["value_range"], header.get("mlp")
+    lengths, layers = model["levels"][0], layers_of(mlp) if mlp else []
+    tables = [root[f"tables/level_{n + 1}"] for n in range(len(model["levels"]))]
     if model["profile"] == "paper":
         at = [[key], *map(np.arange, lengths[1:])]
         inputs = np.concatenate([interpolated(table, lengths, at) for table in tables])
-        for weight, bias, _ in layers:
+        for number in range(1, model["hidden_layers"] + 2):
+            weight, bias = (root[f"mlp/{kind}_{number}"][...] for kind in ("weight", "bias"))
             out = np.tensordot(weight, inputs, 1) + bias[:, None, None, None]
             inputs = np.maximum(out, 0)
         frame = np.clip(low + out[0] * (high - low), low, high)
@@ -85,10 +97,10 @@ def values(path, key):
             corner = zip((key // tile[0], *start), tile, strict=True)
             t, *space = at = tuple(slice(i * s, (i + 1) * s) for i, s in corner)
             base = tables[0][(*at, 0)]
-            base = corrected(base, layers, model["head"]) if layers else base
+            base = corrected(base, layers, mlp) if layers else base
             base = base if np.dtype(model["values"]).kind == "f" else np.rint(base)
-            more = parts["0.corrections"][at] if "0.corrections" in parts else 0 * base
+            more = root["corrections"][at] if "corrections" in root else 0 * base
             frame[tuple(space)] = (base + more)[key - t.start]
-    bits = np.bitwise_or.reduce(parts["0.occupancy.bits"][:, key])
+    bits = np.bitwise_or.reduce(root["occupancy"][:, key])
     root.store.close()
     return np.where(occupied(bits, lengths[1:]), frame, np.nan)

@@ -89,10 +89,8 @@ def test_features_that_a_file_lacks_or_has_merged_are_refused(run, tmp_path) -> 
         only_features(volume, [LOW])
 
 
-@pytest.mark.parametrize("count", [8, 9])
-def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
-    """The numbers of the mask have 8 bits; more features have bits."""
-    features = tuple(f"interval:{n / 10:g}:{n / 10 + 0.05:g}" for n in range(count))
+def test_many_features_are_apart_in_coded_files_too(tmp_path) -> None:
+    features = tuple(f"interval:{n / 10:g}:{n / 10 + 0.05:g}" for n in range(9))
     config = EncodeConfig(
         preset="published", features=features, epochs=1, width=4, dilation=0, tables="transform"
     )
@@ -101,9 +99,7 @@ def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
     fhash_codec.export_plain(path, plain)
     for name in (path, plain):
         with fhash_codec.open(name) as volume:
-            masked = "occupancy/mask" in volume.container.arrays
-            assert masked == (count == 8 and name == path)
-            assert masked != ("occupancy/bits" in volume.container.arrays)
+            assert volume.container.arrays["occupancy"].shape[0] == 9
             source = ramp()[2]
             for feature in (features[0], features[-1]):
                 low, high = (np.float32(end) for end in feature.split(":")[1:])
@@ -176,7 +172,7 @@ def test_missing_integers_come_back_as_the_fill_value_of_the_source(
     figures = fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(**promise, **QUICK))
     assert figures["raw_bytes"] == labels("i1").nbytes
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert "missing/bits" not in volume.container.arrays
+        assert "missing" not in volume.container.arrays
         assert volume.dtype == (np.float32 if fill is None else np.int8)
         gaps = np.isnan(volume.read(0))
         np.testing.assert_array_equal(gaps, np.isnan(series.read(0)))
@@ -377,10 +373,10 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch) -> Non
 
         monkeypatch.setattr(StoredArray, "read", recorded)
         volume.read(2)
-        steps = [region[0] for name, region in asked if name == "parts/0.tables.level_1"]
+        steps = [region[0] for name, region in asked if name == "tables/level_1"]
         assert steps
         assert all(step == slice(1, 2) for step in steps)
-        assert len([name for name, _ in asked if name == "parts/0.occupancy.bits"]) == 1
+        assert len([name for name, _ in asked if name == "occupancy"]) == 1
 
 
 def wind(dtype: str) -> np.ndarray:

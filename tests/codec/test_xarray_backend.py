@@ -60,38 +60,6 @@ def shown(path: Path) -> xarray.Dataset:
         return xarray.open_zarr(store, consolidated=False, chunks=None).load()
 
 
-@pytest.mark.parametrize("tile", ["whole", "2x4x6x10"])
-@pytest.mark.parametrize("effort", [1, 3])
-def test_xarray_shows_the_variable(tmp_path: Path, tile: str, effort: int) -> None:
-    path = tmp_path / "run.fhz"
-    config = EncodeConfig(effort=effort, max_error=0.01, tile=tile, timings=False)
-    fhash_codec.encode(series(), path, config)
-    dataset = shown(path)
-    assert list(dataset.data_vars) == ["rain_rate"]
-    assert dataset["rain_rate"].dims == ("time", "height", "y", "lon")
-    assert dataset["rain_rate"].attrs == {"units": "mm h-1"}
-    with fhash_codec.open(path) as volume:
-        assert volume.name == "rain rate"
-        assert volume.info["arrays"]["rain_rate"]["shape"] == list(SHAPE)
-        np.testing.assert_array_equal(dataset["rain_rate"], volume[...])
-        assert volume.verify()
-
-
-def test_of_features_it_shows_the_box_and_nan_outside(tmp_path: Path) -> None:
-    path = tmp_path / "run.fhz"
-    config = EncodeConfig(effort=2, max_error=0.01, features=("interval:1.2:9",), dilation=0)
-    fhash_codec.encode(series(), path, config)
-    with fhash_codec.open(path) as volume:
-        box = tuple(slice(low, high) for low, high in volume.box)
-        expected = volume[(slice(None), *box)]
-    found = shown(path)["rain_rate"]
-    np.testing.assert_array_equal(found, expected)
-    assert np.isnan(expected).any()
-    assert found.dims[0] == "time"
-    for name, own, whole in zip(found.dims[1:], found.shape[1:], SHAPE[1:], strict=True):
-        assert str(name).endswith("_box") == (own != whole)
-
-
 VALUES = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5) + 1
 NAMES = {
     "zeta ": "zeta",

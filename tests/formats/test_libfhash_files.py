@@ -231,7 +231,7 @@ def test_few_reads_and_few_bytes_and_no_tile_twice(tiled: Path) -> None:
             file.reads.clear()
             found = file.read(step, region)
             read = sum(length for _, length in file.reads)
-            # The first step of a tile needs it, and the index of the shard where it is not known.
+            # The first step of a tile needs it, and the sizes of tiles where they are not known.
             assert len(file.reads) <= (2, 0, 1, 0)[step]
             assert read < len(data) / 16
             with fhash_codec.open(tiled) as volume:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -231,9 +233,19 @@ def test_no_golden_is_left_untested() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_any_zarr_reader_opens_them(name: str) -> None:
-    with fhash_codec.open(HERE / f"{name}.fhz") as volume:
+def test_any_zarr_reader_lists_them_and_reads_what_is_no_tile(name: str) -> None:
+    with warnings.catch_warnings(), fhash_codec.open(HERE / f"{name}.fhz") as volume:
+        warnings.simplefilter("error")
         group = zarr.open_group(ZipStore(HERE / f"{name}.fhz", mode="r"), mode="r", zarr_format=3)
         assert group.attrs["fhash"]["format"] == "fhash"
-        for array in volume.container.arrays.values():
-            np.testing.assert_array_equal(group[array.name][...], array.read())
+        listed = {path: node for path, node in group.members(None) if isinstance(node, zarr.Array)}
+        assert set(listed) == set(volume.container.arrays)
+        for path, array in volume.container.arrays.items():
+            if array.together is None:
+                np.testing.assert_array_equal(listed[path][...], array.read())
+                continue
+            assert listed[path].attrs["tiles"]["package"] == "fhash"
+            sizes = [len(array.coded(index)) for index in np.ndindex(*array.grid)]
+            if prod(array.together) > 1:
+                assert listed[path][...].ravel().tolist() == sizes
+            assert not listed[path].nchunks_initialized or prod(array.together) > 1

@@ -1,7 +1,9 @@
-"""A hostile file through xarray, as Zarr, with further steps, and merged with another part."""
+"""A hostile file through C, through xarray, as Zarr, with further steps, and merged with another
+part."""
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import replace
 from math import prod
@@ -16,7 +18,11 @@ import zarr
 import fhash_codec
 from fhash_codec import Volume, zarr_store
 from fhash_codec.xarray_backend import shown_names
+from fhash_formats.errors import FhashError
+from fhash_formats.native import ffi, library, pointer
 from fhash_formats.series import ArraySeries
+from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.tile import checked
 
 FEW = 1 << 14
 """Most vertices of a frame that is appended, and of a file whose steps are compared."""
@@ -49,6 +55,46 @@ class Further:
         grown = mutation.golden.endswith("-grown")
         self.grows = mutation.sealed and (grown or mutation.number % STRIDE == 0)
         self.is_part = "-part-" in mutation.golden
+
+    def by_c(self) -> str | None:
+        """Read a region of one step and the positions through the C interface."""
+        step, found, refused = self.region[0].start, None, None
+        with fhash_codec.open(self.path) as opened:
+            names = [opened.name] if isinstance(opened, Volume) else list(opened)
+            volume = opened if isinstance(opened, Volume) else opened[self.variable or names[0]]
+            number = names.index(self.variable) if self.variable in names else 0
+            space = tuple((span.start, span.stop) for span in self.region[1:])
+            wanted = volume.read(step, space)
+            try:
+                found, positions = self._read_by_c(number, step, volume.float_dtype, volume.shape)
+            except FhashError as error:
+                refused = error
+            if found is None:
+                return f"C refuses what Python reads: {refused}"
+            for own, theirs in zip(volume.coords.values(), positions, strict=True):
+                if own.values.tobytes() != theirs.tobytes():
+                    return "C: other positions"
+            # Sums of the published network are made in another order.
+            same = volume.profile != "compact" or np.array_equal(found, wanted, equal_nan=True)
+        return None if same else "C: other values than in Python"
+
+    def _read_by_c(self, number: int, step: int, dtype: Any, shape: Any) -> Any:
+        """Values of the region at a step, and positions along each axis."""
+        context, made = library().fhash_context_create(0, 1), ffi.new("fhash_file **")
+        try:
+            checked("fhash_open_path", context, os.fsencode(self.path), made)
+            values = np.empty([span.stop - span.start for span in self.region[1:]], dtype)
+            ends = [end for span in self.region[1:] for end in (span.start, span.stop)]
+            kind = list(DTYPES).index(np.dtype(dtype).name) + 1
+            checked("fhash_read", made[0], number, step, ends, 0, kind, pointer(values))
+            positions = [np.empty(length) for length in shape]
+            for axis, room in enumerate(positions):
+                place = (number, axis, pointer(room), ffi.NULL)
+                checked("fhash_coordinate", made[0], *place)
+            return values, positions
+        finally:
+            library().fhash_close(made[0])
+            library().fhash_context_destroy(context)
 
     def by_xarray(self) -> str | None:
         """Open the file by xarray, and read a region of a variable."""

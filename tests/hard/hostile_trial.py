@@ -29,7 +29,7 @@ import numpy as np
 from containers import unpack
 from documents import Documents, header_of
 from further_trials import Further
-from mutated_tiles import inner_chunks, settings_of
+from mutated_tiles import Tiles, settings_of, type_of
 from PIL import Image
 
 import fhash_cli.main
@@ -115,6 +115,7 @@ class Trial:
             lambda: self._picture(picture),
         )
         further = Further(self.path, self.folder, self.mutation, self.variable, region)
+        self._end("C", lambda: said(further.by_c))
         self._end("xarray", lambda: said(further.by_xarray))
         self._end("zarr", lambda: said(further.by_zarr))
         if further.grows:
@@ -229,8 +230,8 @@ class Trial:
     ) -> str | None:
         """Return what is wrong with decoded values, or None.
 
-        They must be finite and have the declared shape; if nothing was sealed, they must be the
-        golden's.
+        They must be finite and have the declared shape; if nothing was sealed, or all that is told
+        is the same, they must be the golden's.
         """
         values = np.load(path)
         os.unlink(path)
@@ -240,7 +241,7 @@ class Trial:
             return f"{what}: infinities"
         if self.mutation.kind == "clip" and self.beyond(values, region):
             return f"{what}: values beyond the range to which they are clipped"
-        if not self.mutation.sealed:
+        if not self.mutation.sealed or self.mutation.kind in mutations.SAME:
             expected = expected_values(self.mutation.golden, self.variable)
             if region is not None:
                 expected = expected[tuple(slice(low, high) for low, high in region)]
@@ -293,33 +294,19 @@ def clip_ends(mutation: mutations.Mutation) -> Any:
     The table has every vertex and step of the domain. With an origin the range is that of the
     differences.
     """
-    parts = unpack(mutation.data)
-    file = Documents(parts)
-    table, document = file.table, file.arrays[file.table]
-    shared = settings_of(document)
-    shape, dtype = document["shape"], np.dtype(document["data_type"])
-    ends = np.empty((2, *shape), dtype)
+    file = Documents(unpack(mutation.data))
+    tiles, shared = Tiles(file, file.table), settings_of(file.arrays[file.table])
+    dtype = type_of(file.arrays[file.table])
+    ends = np.empty((2, *tiles.metadata.shape), dtype)
     ends[0], ends[1] = (-np.inf, np.inf) if dtype.kind == "f" else most_of(dtype)
-    for member, data in parts:
-        if not member.startswith(f"{table}/c/"):
-            continue
-        sharding, present, chunks = inner_chunks(document, member, data)
-        counts = [n // m for n, m in zip(sharding.shard_shape, sharding.chunk_shape, strict=True)]
-        shard = [int(number) for number in member.removeprefix(f"{table}/c/").split("/")]
-        for number, chunk in zip(np.flatnonzero(present), chunks, strict=True):
-            stream = parse_stream(chunk)
+    for member in tiles.members:
+        for place, data in tiles.streams(member).items():
+            stream = parse_stream(data)
             own = stream.settings
             settings = shared if own is None else TileSettings.from_bytes(own)
             if settings is not None and settings.clip and stream.kind in (TRANSFORMED, PREDICTED):
-                inner = np.unravel_index(number, counts)
-                tile = tuple(
-                    slice((i * count + j) * length, (i * count + j + 1) * length)
-                    for i, j, count, length in zip(
-                        shard, inner, counts, sharding.chunk_shape, strict=True
-                    )
-                )
                 for end, limit in zip(ends, (settings.low, settings.high), strict=True):
-                    end[tile] = rounded(limit, settings.origin, dtype)
+                    end[tiles.metadata.region(place)] = rounded(limit, settings.origin, dtype)
     return ends
 
 

@@ -10,6 +10,7 @@ import random
 from collections.abc import Callable
 from copy import deepcopy
 from math import prod
+from types import SimpleNamespace
 from typing import Any
 
 from containers import Parts
@@ -17,7 +18,6 @@ from documents import (
     DOCUMENT,
     FLOATS,
     GONE,
-    GROUP,
     LARGE,
     OTHERS,
     SPECIAL,
@@ -29,25 +29,24 @@ from documents import (
     dumped,
     hostile,
     is_plain,
-    path_of,
     places,
     put,
     replaced,
 )
-from mutated_tiles import coding, tile_of
+from mutated_tiles import head_of, is_coded, put_settings, settings_of, tile_of, unchecked
 
-from fhash_formats.container.header import KNOWN_FEATURES
-from fhash_formats.container.hierarchy import array_path
+from fhash_formats.container.header import KNOWN_FEATURES, TABLE
+from fhash_formats.container.hierarchy import path_of
 from fhash_formats.support.values import DTYPES
 
 AXES = ("time", "z", "y", "x")
 KINDS_OF_NUMBERS = (*DTYPES, "bool", "complex64")
 FEATURES = sorted(KNOWN_FEATURES)
 NODES = (
-    *("u", "v", "time", "x", "parts", "tables", "zarr.json", "", "a.b", "a/b", "__u", "x" * 101),
-    *("consolidated_metadata", "coords", "auxiliary", "U"),
+    *("u", "v", "time", "x", "v0", "v1", "v9", "v00", "v0/", "tables", "zarr.json", "", "a.b"),
+    *("a/b", "__u", "x" * 101, "t", "c", "t/0", "mlp", "auxiliary", "V0", "v\x000", "v0\x00"),
 )
-"""Names of arrays: of others, of groups, and those that are not allowed."""
+"""Names of groups and arrays: of others, and those that are not allowed."""
 
 
 def _named(chance: random.Random, parts: Parts) -> str:
@@ -116,8 +115,7 @@ def _domain(chance: random.Random, parts: Parts) -> Parts:
     shape = header["domain"]["shape"]
     for axis in chance.sample(range(4), chance.choice((1, 2, 4))):
         shape[axis] = max(shape[axis], chance.choice((100, 2**10, 2**20, 2**40)))
-    if "coordinates" in header:
-        header["coordinates"] = {name: _rule(chance) for name in AXES}
+    header["coordinates"] = {name: _rule(chance) for name in AXES}
     return file.packed()
 
 
@@ -137,16 +135,31 @@ def _rule(chance: random.Random, old: Any = None) -> dict[str, Any]:
 
 def _coordinates(chance: random.Random, parts: Parts) -> Parts:
     """Replace positions by absurd ones: all equal, beyond their type, descending, with vanishing
-    steps."""
+    steps, not finite, those of other variables; or positions of other axes."""
     file = Documents(parts)
     header = chance.choice(file.headers)
-    numbers = (0, 1, -1, 1e308, -1e308, 5e-324, 2.5)
+    numbers = (0, 1, -1, 1e308, -1e308, 5e-324, 2.5, *TEXTS)
     for number in chance.sample(range(4), chance.choice((1, 1, 2, 4))):
-        length = header["domain"]["shape"][number]
+        length, turn = header["domain"]["shape"][number], chance.random()
         listed = {"values": chance.choices(numbers, k=length)}
-        chosen = listed if chance.random() < 0.4 else _rule(chance)
-        header.setdefault("coordinates", {})[AXES[number]] = chosen
+        chosen = listed if turn < 0.3 else _rule(chance) if turn < 0.6 else chance.choice(POSITIONS)
+        axis = AXES[number] if chance.random() < 0.9 else chance.choice(NODES)
+        header.setdefault("coordinates", {})[axis] = chosen
+    if chance.random() < 0.1:  # of each variable those of the next one
+        for number, each in enumerate(file.headers, start=1):
+            each.setdefault("coordinates", {})[chance.choice(AXES)] = number % len(file.headers)
     return file.packed()
+
+
+TEXTS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "1")
+POSITIONS: tuple[Any, ...] = (
+    *[number for number in range(5) for _ in range(5)],
+    *(-1, True, False, 0.0, 2**31, 2**63, 2**64, 10**30, "0", "NaN", None, [], [0], {"values": 0}),
+    *({"values": []}, {"values": [0] * (1 << 20)}, {"values": ["NaN"] * ((1 << 20) + 1)}),
+    *({"ulps": [0] * (1 << 20)}, {"values": [10**30, 2**64, 2**63 - 1]}, {"values": [[0]]}),
+    *({"name": "x"}, {"name": ""}, {"name": 0}, {"attributes": []}, {"attributes": {"units": 0}}),
+)
+"""What may stand in place of an axis' object: numbers of variables, and objects."""
 
 
 def _pair(chance: random.Random, old: Any) -> list[float]:
@@ -209,9 +222,9 @@ HEADER: tuple[Rule, ...] = (
 )
 """Numbers of the header on which decoding depends; each is allowed by itself."""
 VARIABLES: tuple[Rule, ...] = (
-    ("variables.*.name|array", (*NODES, "wind", "again", *OTHERS[:4])),
-    ("variables.*.dimensions", lambda chance, old: chance.choice((old[::-1], old[:3], old * 2))),
-    ("variables.*.dimensions", lambda chance, old: chance.choices((*old, *NODES), k=4)),
+    *[("variables.*.name|group", (*NODES, "wind", "again", *OTHERS[:4], GONE))] * 2,
+    ("variables.*.coordinates", (*OTHERS, {"time": 0}, {"time": 1}, dict.fromkeys(AXES, 0))),
+    ("variables.*.coordinates.*", POSITIONS),
     ("variables", lambda chance, old: chance.sample(old, chance.randrange(len(old) + 1))),
     ("variables", lambda chance, old: [*old, {**deepcopy(chance.choice(old)), "name": "again"}]),
     (
@@ -225,14 +238,14 @@ VARIABLES: tuple[Rule, ...] = (
 )
 """Keys that say how many variables there are, their names and order, and the root's keys."""
 SHARED = (
-    *("auxiliary/lat", "auxiliary/lon", "auxiliary/none", "tables/level_1", "coords/x", "../u"),
-    *("auxiliary/", "", "occupancy/bits"),
+    *("auxiliary/lat", "auxiliary/lon", "auxiliary/none", "tables/level_1", "x", "../u"),
+    *("auxiliary/", "", "occupancy", "v0/tables/level_1", "missing"),
 )
-"""Internal names of arrays that a variable may say to share."""
+"""Names of arrays that a variable may say to share."""
 
 
 def _sharing(chance: random.Random, old: Any) -> dict[str, Any]:
-    others = (*[*range(-1, 4)] * 20, *NODES, None, 1.0, True, [])
+    others = (*[*range(-1, 4)] * 20, *NODES, None, 1.0, True, [], [0, "auxiliary/lat"], [0, "lat"])
     return {chance.choice(SHARED): chance.choice(others) for _ in range(chance.choice((1, 1, 2)))}
 
 
@@ -240,14 +253,6 @@ SHARES: tuple[Rule, ...] = (
     *[("variables.*.shares", _sharing)] * 2,
     ("variables.*.shares", OTHERS),
     ("variables.*.source", ({}, {"dimensions": []}, None, GONE)),
-)
-CONSOLIDATED: tuple[Rule, ...] = (
-    ("consolidated_metadata.**", hostile),
-    (
-        "consolidated_metadata.metadata",
-        lambda chance, old: {**old, chance.choice(NODES): chance.choice([*old.values()])},
-    ),
-    ("consolidated_metadata", (GONE, *OTHERS)),
 )
 
 TYPES = (
@@ -335,8 +340,8 @@ PART: tuple[Rule, ...] = (
     ("model.parameters", (1, 2, *LARGE[:12])),
 )
 WHOLE = (
-    *("tables/level_1", "coords/x", "coords/time", "missing/bits", "steps/errors"),
-    *("auxiliary/wide", "auxiliary/other", "occupancy/mask", "x", "whole/x"),
+    *("tables/level_1", "key_frames", "missing", "step_errors", "step_figures"),
+    *("auxiliary/wide", "auxiliary/other", "occupancy", "x", "whole/x"),
 )
 """Names of arrays that the whole is said to have."""
 
@@ -350,7 +355,7 @@ def _part(chance: random.Random, parts: Parts) -> Parts:
         name = f"whole/{chance.choice(WHOLE)}"
         shape = [chance.choice((1, 3, 1 << 20, 1 << 22))]
         kind = chance.choice(("float64", "uint8", "int64"))
-        return added(parts, array_of_zeros(name, shape, kind, array_path(0, name)))
+        return added(parts, array_of_zeros(name, shape, kind))
     put(chance, file.header, PART)
     return file.packed()
 
@@ -387,23 +392,21 @@ GROWN: tuple[Rule, ...] = (
 def _grown(chance: random.Random, parts: Parts) -> Parts:
     file = Documents(parts)
     document, header = file.arrays.get(file.table), file.header
-    tiled = document is not None and coding(document) == "fhash.transform"
+    tiled = document is not None and is_coded(document)
     if not tiled or "max_error" not in header.get("config", {}) or "part" in header:
         raise NothingFitsError
     assert document is not None
     turn = chance.random()
     if turn < 0.1:  # an array that a growing file would have to carry on
-        names = ("extra", "steps/errors", "steps/figures", "auxiliary/a", "occupancy/bits")
-        name = chance.choice((*names, "coords/x"))
+        names = ("extra", "step_errors", "step_figures", "auxiliary/a", "occupancy", "x")
         length = chance.choice((1, 7, prod(tile_of(document)), 1 << 22))
-        path = name if name == "extra" else path_of(header, name)
-        new = array_of_zeros(name, [length], chance.choice(("float64", "uint8")), path)
-        group = [(f"parts/{DOCUMENT}", GROUP)] if path.startswith("parts/") else []
-        return added(parts, [*group, *new])
+        kind = chance.choice(("float64", "uint8"))
+        return added(parts, array_of_zeros(chance.choice(names), [length], kind))
     if turn < 0.2:
-        steps = chance.choice((1, 2, 3, 5, 6, 8))
-        header["domain"]["shape"][0] = document["shape"][0] = steps
+        steps, tiles = chance.choice((1, 2, 3, 5, 6, 8)), document["attributes"]["tiles"]
+        header["domain"]["shape"][0] = tiles["shape"][0] = steps
         header["model"]["levels"][0][0] = steps
+        document["shape"][0] = -(-steps // tiles["tile"][0])
     else:
         put(chance, header, GROWN)
     return file.packed()
@@ -420,15 +423,7 @@ PLAIN: tuple[Rule, ...] = (
     ("header.model.levels", _turned),
     ("top.required_features", _some("plain", "transform", "mask")),
     ("top.required_features", (FEATURES, ["plain"] * 2)),
-    ("header.model.head", (None,)),
-    (
-        "header.model.head.hidden",
-        ([], [4], [4, 3], [3, 4], [4, 3, 1], [64] * 3, [65], [0]),
-    ),
-    (
-        "header.model.head.sigma|low|high",
-        (*FLOATS, 0.0, 1.0, 1e-38, 2.0**-100, 2.0**100, 2.0**127),
-    ),
+    ("header.mlp", (None, GONE)),
     *[("header.model.**", hostile)] * 2,
     ("header.coordinates", ({}, {"z": {}}, {"time": {"values": [0]}}, [])),
     ("header.model.gains", OTHERS),
@@ -482,6 +477,7 @@ INTEGERS: tuple[Rule, ...] = (
     ("header.variable.fill", (GONE,)),
     ("header.variable.dtype", tuple(DTYPES)),
     ("header.model.tables", tuple(DTYPES)),
+    ("table.attributes.tiles.data_type", tuple(DTYPES)),
     ("table.data_type", tuple(DTYPES)),
     ("table.fill_value", (*FILLS, *OTHERS)),
     ("header.features", (["all"], ["isosurface:0"], [], None, 0)),
@@ -498,7 +494,8 @@ def _integers(chance: random.Random, parts: Parts) -> Parts:
         raise NothingFitsError
     if chance.random() < 0.2:  # another type everywhere
         kind = chance.choice(list(DTYPES))
-        variable["dtype"] = file.header["model"]["tables"] = document["data_type"] = kind
+        told = document["attributes"]["tiles"] if is_coded(document) else document
+        variable["dtype"] = file.header["model"]["tables"] = told["data_type"] = kind
         variable["fill"] = chance.choice(FILLS)
     else:
         for _ in range(chance.choice((1, 1, 2, 3))):
@@ -514,7 +511,8 @@ ARRAY: tuple[Rule, ...] = (
         for path in (
             "shape.*",
             "chunk_grid.configuration.chunk_shape.*",
-            "codecs.0.configuration.chunk_shape.*",
+            "attributes.tiles.shape.*",
+            "attributes.tiles.tile.*",
         )
     ],
     ("codecs", lambda chance, old: chance.choice((old[1:], old[:-1], old * 2, old[::-1]))),
@@ -539,7 +537,7 @@ def _rules(
         file = Documents(parts)
         if fits is not None and not fits(file):
             raise NothingFitsError
-        tables = {name: file.arrays[name] for name in file.arrays if ".tables." in name}
+        tables = {name: each for name, each in file.arrays.items() if name.startswith("tables/")}
         every = {"header": file.header, "top": file.top, "tables": tables}
         put(chance, every if of == "every" else getattr(file, of), rules)
         return file.packed()
@@ -548,22 +546,129 @@ def _rules(
 
 
 def _places(chance: random.Random, parts: Parts) -> Parts:
-    """Put an array at another place: among the parts, at the root, to another variable."""
+    """Put an array at another place: at the root, to another variable, below an array."""
     file = Documents(parts)
-    names = [name for name in file.arrays if name]
+    names = list(file.arrays)
     name, number = chance.choice(names), chance.randrange(len(file.headers) + 1)
-    ends = ("tables.level_1", "coords.x", "key_frames", "", "..")
+    ends = ("tables/level_1", "key_frames", "missing", "mlp/bias_1", "auxiliary/lat", "", "..")
     other = chance.choice(
         (
-            *(f"parts/{number}.{end}" for end in ends),
-            *(f"parts/{chance.choice(NODES)}.mlp.bias_1", f"{file.table}_2", f"parts/{number}"),
-            *("extra/a", chance.choice(names), chance.choice(NODES)),
+            *(f"v{number}/{end}" for end in ends),
+            *(*ends, f"{file.table}_2", f"{file.table}/t", f"{file.table}/c/0", f"v{number}"),
+            *("extra/a", "t/0", "c", chance.choice(names), chance.choice(NODES)),
         )
     )
     mine = [(f"{other}{m[len(name) :]}", data) for m, data in parts if m.startswith(f"{name}/")]
     copied = chance.random() < 0.4
     rest = [item for item in parts if copied or not item[0].startswith(f"{name}/")]
-    return added([*mine, *rest], [])
+    return added(rest, mine) if chance.random() < 0.7 else [*mine, *rest]
+
+
+def _grouped(chance: random.Random, parts: Parts) -> Parts:
+    """Put the arrays of the only variable into a group, as those of several lie, or into none."""
+    file = Documents(parts)
+    group = chance.choice(("v0", "v0", "v1", "v00", "g", "tables"))
+    if "group" in file.header:
+        moved = [(name.removeprefix("v0/"), data) for name, data in parts]
+    else:
+        moved = [(f"{group}/{name}", data) for name, data in parts if name != DOCUMENT]
+        file.header["group"] = group
+    return added([(DOCUMENT, dumped(file.root))], moved)
+
+
+TILES: tuple[Rule, ...] = (
+    ("codec", (GONE, "fhash.transform2", "zstd", "", *OTHERS)),
+    ("package", (GONE, "", *OTHERS)),
+    ("data_type", (GONE, *KINDS_OF_NUMBERS, *OTHERS)),
+    *[("shape|tile.*", lambda chance, old: chance.choice((*LENGTHS, old + 1, old - 1)))] * 3,
+    ("shape.*", lambda chance, old: chance.choice((*LENGTHS, old + 1, old - 1, 0, -1, 1.0))),
+    ("tile.*", lambda chance, old: chance.choice((*LENGTHS, old + 1, old - 1, 0, -1, 1.0))),
+    ("shape|tile", lambda chance, old: chance.choice((old[::-1], old[1:], [*old, 1], [1] * 9))),
+    ("shape|tile", (GONE, *OTHERS)),
+    (
+        "axes",
+        lambda chance, old: chance.choice(
+            (["t", "z", "y", "x"], ["x", "y", "z", "t"], ["", "", "", ""], ["t"] * 4, None, GONE)
+        ),
+    ),
+    ("axes", lambda chance, old: chance.choices(("t", "z", "y", "x", "", "w"), k=4)),
+    (
+        "settings",
+        lambda chance, old: chance.choice(
+            (
+                *(GONE, "", "====", "A", "AA==", "AAA", old and old[:-4], old and old + "AAAA"),
+                *(old and old + "=", old and f" {old}", old and f"{old}\n", "A" * 10**6),
+            )
+        ),
+    ),
+    ("unknown", (1, {"must_understand": False})),
+    *[("**", hostile)] * 2,
+)
+"""Keys of the attribute `tiles`."""
+
+
+def _tiles(chance: random.Random, parts: Parts) -> Parts:
+    """Change what is said of the tiles of an array, mostly in agreement with its index."""
+    file = Documents(parts)
+    coded = [document for document in file.arrays.values() if is_coded(document)]
+    if not coded:
+        raise NothingFitsError
+    document = chance.choice(coded)
+    tiles, turn = document["attributes"]["tiles"], chance.random()
+    if turn < 0.1:
+        document["attributes"]["tiles"] = chance.choice((*OTHERS, [tiles], json.dumps(tiles)))
+    elif turn < 0.2:
+        ordinary = chance.choice(list(file.arrays.values()))
+        ordinary.setdefault("attributes", {})["tiles"] = tiles
+    elif turn < 0.35:  # tiles that the grid has room for
+        axis = chance.randrange(len(tiles["tile"]))
+        tiles["tile"][axis] = chance.choice((1, 2, 3, 5, 8, 2**20, 2**40, 2**60, 2**62))
+        document["shape"][axis] = -(-tiles["shape"][axis] // tiles["tile"][axis])
+    else:
+        put(chance, tiles, TILES)
+    return file.packed()
+
+
+MLP: tuple[Rule, ...] = (
+    ("mlp", (None, GONE, *OTHERS)),
+    ("mlp.widths|sigma|range|scales|biases|weights", (GONE, *OTHERS)),
+    ("mlp.widths", ([], [1], [4], [64] * 3, [64] * 4, [65], [0], [2**40], [1.0], [3, 1], [255])),
+    ("mlp.sigma", (*FLOATS, 0, 0.0, 1, 2.0**-100, 2.0**-101, 2.0**100, 2.0**101, -1, *SPECIAL)),
+    ("mlp.range", (*[[a, b] for a in FLOATS for b in FLOATS[::4]], [0], [0, 1, 2], [2, 1])),
+    ("mlp.scales.*", (0, 0.0, -1, 65504, 65519.9, 65520, 1e300, 6e-8, 3e-8, 2.9e-8, 1e-300)),
+    ("mlp.scales|biases", lambda chance, old: chance.choice((old[1:], [*old, 1], old[::-1]))),
+    ("mlp.biases.*", (127, 128, -127, -128, 255, 256, 0.0, 1.5, *LARGE)),
+    (
+        "mlp.weights",
+        lambda chance, old: chance.choice(
+            (
+                *(old[:-1], old + "A", old[1:], "", old * 2, old + "=", "A" * len(old)),
+                *(old.replace(old[0], letter) for letter in ("/", "+", "=", "\0", "\xe9", " ")),
+                *(f"{old}\0", "+" * len(old), "A" * 10**6),
+            )
+        ),
+    ),
+    *[("mlp.**", hostile)] * 2,
+)
+"""Keys of the MLP."""
+
+
+def _mlp(chance: random.Random, parts: Parts) -> Parts:
+    """Change the MLP of the header, or give tiles another one."""
+    file = Documents(parts)
+    header = chance.choice(file.headers)
+    document = file.arrays.get(path_of(header, TABLE))
+    if document is None or header["model"]["profile"] != "compact":
+        raise NothingFitsError
+    settings = settings_of(document) if is_coded(document) else None
+    if header.get("mlp") is None or chance.random() < 0.3:
+        header["mlp"] = head_of(chance).to_json()
+        if settings is not None and chance.random() < 0.9:
+            head = SimpleNamespace()  # its block is empty
+            put_settings(document, unchecked(settings, head=head).to_bytes(apart=True))
+    if chance.random() < 0.8:
+        put(chance, header, MLP)
+    return file.packed()
 
 
 KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
@@ -581,7 +686,9 @@ KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
     "variables": _rules(VARIABLES),
     "shares": _rules(SHARES),
     "places": _places,
-    "consolidated": _rules(CONSOLIDATED, of="root"),
+    "grouped": _grouped,
+    "tiles": _tiles,
+    "mlp": _mlp,
     "variables length": _length,
     "source": _source,
     "part": _part,

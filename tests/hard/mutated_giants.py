@@ -21,15 +21,15 @@ from documents import (
     NothingFitsError,
     added,
     array_of_zeros,
+    dumped,
     is_plain,
-    path_of,
     without,
 )
-from mutated_tiles import CODED_FEATURES, PLAIN, is_coded, settings_of, shard_of
+from mutated_tiles import CODED_FEATURES, PLAIN, Tiles, is_coded, settings_of
 from reference.sections import pack_planes
 
-from fhash_formats.container.array import Sharding
-from fhash_formats.container.hierarchy import array_path
+from fhash_formats.container.array import ArrayMetadata, transform_codecs
+from fhash_formats.container.hierarchy import path_of
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.tile_format import (
     EMPTY,
@@ -60,35 +60,39 @@ def _tiles(chance: random.Random, parts: Parts) -> Parts:
         raise NothingFitsError
     file.top["required_features"] = CODED_FEATURES
     kind = chance.choice(list(DTYPES))
-    shape, chunk, shard = _shapes(chance, file.header, kind)
+    shape, tile = _shapes(chance, file.header, kind)
     settings = settings_of(document)
     if settings is None or chance.random() < 0.7:
         settings = PLAIN
     elif chance.random() < 0.5:
         settings = replace(settings, transform=PLAIN.transform)
-    document.update(shape=shape, data_type=kind, fill_value=0)
-    document["chunk_grid"]["configuration"]["chunk_shape"] = shard
-    configuration = {
-        "chunk_shape": chunk,
-        "codecs": [{"name": "fhash.transform", "configuration": {"settings": settings.to_text()}}],
-        "index_codecs": [
-            {"name": "bytes", "configuration": {"endian": "little"}},
-            {"name": "crc32c"},
-        ],
-        "index_location": "end",
-    }
-    document["codecs"] = [{"name": "sharding_indexed", "configuration": configuration}]
-    sharding = Sharding(shard_shape=tuple(shard), chunk_shape=tuple(chunk), codecs=())
-    present = sharding.present((0, 0, 0, 0), tuple(shape))
-    chunks = [_empty_stream(chance, np.dtype(kind).itemsize)] * int(present.sum())
-    kept = without(file.packed(), f"{file.table}/c", "parts/0.missing.")
-    return [*kept, (f"{file.table}/c/0/0/0/0", shard_of(sharding, present, chunks))]
+    settings = replace(settings, head=None)
+    file.header.pop("mlp", None)
+    metadata = ArrayMetadata(
+        shape=tuple(shape),
+        dtype=np.dtype(kind),
+        chunk_shape=tuple(tile),
+        codecs=transform_codecs(settings),
+    )
+    counts = [chance.choice((1, n, n, 2 * n)) for n in metadata.grid]
+    if chance.random() < 0.1:  # an index of many tiles that are none
+        counts[chance.randrange(4)] = chance.choice((1 << 12, 1 << 19, 1 << 30))
+    file.arrays[file.table] = replace(metadata, together=tuple(counts)).to_dict()
+    stream = _empty_stream(chance, np.dtype(kind).itemsize)
+    new: dict[str, bytes] = {}
+    if prod(counts) <= 1 << 20:  # others are refused before a member is looked for
+        tiles = Tiles(file, file.table)
+        for member in tiles.members:
+            streams = [stream] * len(list(tiles.metadata.chunks_of(member)))
+            new |= tiles.packed(member, streams)
+    kept = without(file.packed(), f"{file.table}/c/", f"{file.table}/t/", "missing/")
+    return [*new.items(), *kept]
 
 
 def _shapes(
     chance: random.Random, header: dict[str, Any], kind: str
-) -> tuple[list[int], list[int], list[int]]:
-    """Declare a giant volume in a header, and return the shapes of the box, a tile and a shard."""
+) -> tuple[list[int], list[int]]:
+    """Declare a giant volume in a header, and return the shapes of the box and of a tile."""
     room = (1 << chance.choice((20, 24, 28, 30, 31))) // np.dtype(kind).itemsize
     chunk = [1, 1, 1, 1]
     for axis in chance.sample(range(4), 4):
@@ -104,7 +108,7 @@ def _shapes(
     _declared(header, shape, domain)
     header["model"]["tables"] = kind
     header["coordinates"] = {name: {} for name in AXES}
-    return shape, chunk, [n * count for n, count in zip(chunk, counts, strict=True)]
+    return shape, chunk
 
 
 def _empty_stream(chance: random.Random, itemsize: int) -> bytes:
@@ -120,18 +124,13 @@ def _empty_stream(chance: random.Random, itemsize: int) -> bytes:
     return seal(chance.choice((EMPTY, EMPTY | MASKED)), [])
 
 
-def _rebuilt(file: Documents, arrays: list[tuple[str, list[int], str]], keep: str = "") -> Parts:
-    """Return a file whose first variable has these arrays of zeros, and of the old ones those whose
-    paths begin with `keep`."""
-    header, shape = file.header, file.header["domain"]["shape"]
-    header.pop("coordinates", None)  # they stand in arrays
-    positions = [(f"coords/{axis}", [n], "float64") for axis, n in zip(AXES, shape, strict=True)]
-    gone = without(file.parts, "parts/", *(f"{name}/" for name in header["dimensions"]))
-    kept = [item for item in file.parts if keep and item[0].startswith(keep)]
-    new = [(f"parts/{DOCUMENT}", GROUP)]
-    for name, lengths, dtype in [*arrays, *positions]:
-        new += array_of_zeros(name, lengths, dtype, path_of(header, name))
-    return added([*gone[:-1], *kept, *new, gone[-1]], [], file.root)
+def _rebuilt(file: Documents, arrays: list[tuple[str, list[int], str]]) -> Parts:
+    """Return a file whose only variable has these arrays of zeros alone."""
+    file.header.pop("coordinates", None)  # 0, 1, 2...
+    new: Parts = []
+    for name, lengths, dtype in arrays:
+        new += array_of_zeros(name, lengths, dtype)
+    return added([(DOCUMENT, dumped(file.root))], new)
 
 
 def _shape(chance: random.Random, axes: range) -> list[int]:
@@ -156,16 +155,15 @@ def _plain(chance: random.Random, parts: Parts) -> Parts:
     model["tile"] = chance.choice((shape, [64] * 4, [2**20] * 4, [1] * 4))
     # A head is applied tile by tile, which takes some 50 us for the smallest tile.
     if chance.random() < 0.5 or (model["tile"] == [1] * 4 and prod(shape) > 1 << 16):
-        model["head"] = None
-    header.pop("missing", None)
+        header.pop("mlp", None)
     bits = -(-prod(1 << (n - 1).bit_length() for n in shape[1:]) // 8)
     arrays: list[tuple[str, list[int], str]] = [
         ("tables/level_1", [*shape, 1], model["tables"]),
         ("key_frames", shape[:1], "int64"),
-        ("occupancy/bits", [1, shape[0], bits], "uint8"),
+        ("occupancy", [1, shape[0], bits], "uint8"),
         *([("corrections", shape, "float32")] if chance.random() < 0.5 else []),
     ]
-    return _rebuilt(file, arrays, keep="parts/0.mlp.")
+    return _rebuilt(file, arrays)
 
 
 def _sparse(chance: random.Random, parts: Parts) -> Parts:
@@ -182,10 +180,10 @@ def _sparse(chance: random.Random, parts: Parts) -> Parts:
         ("mlp/weight_1", [1, 1], "float32"),
         ("mlp/bias_1", [1], "float32"),
         ("key_frames", [1], "int64"),
-        ("occupancy/bits", [len(header["features"]), 1, -(-prod(shape) // 8)], "uint8"),
+        ("occupancy", [len(header["features"]), 1, -(-prod(shape) // 8)], "uint8"),
     ]
     rebuilt = Documents(_rebuilt(file, arrays))
-    rebuilt.arrays["parts/0.tables.level_1"]["attributes"] = {"counts": [rows]}
+    rebuilt.arrays["tables/level_1"]["attributes"] = {"counts": [rows]}
     return rebuilt.packed()
 
 
@@ -220,32 +218,36 @@ def _source(chance: random.Random, parts: Parts) -> Parts:
             ]
         for header in headers[1:]:
             header["shares"] = {"auxiliary/long": number}
-        path = array_path(number, "auxiliary/long")
-        new = array_of_zeros("auxiliary/long", [length], "float64", path)
-        return added(parts, [(f"parts/{DOCUMENT}", GROUP), *new], file.root)
+        path = path_of(headers[0], "auxiliary/long")
+        return added(parts, array_of_zeros("", [length], "float64", path), file.root)
     return file.packed()
 
 
 def _variables(chance: random.Random, parts: Parts) -> Parts:
-    """Declare hundreds of variables, on one grid or each on its own, and long lists."""
+    """Declare hundreds of variables, with positions of their own or of others, and long lists."""
     file = Documents(parts)
+    if "group" not in file.header:
+        file.header["group"] = "v0"
+        moved = [(f"v0/{name}", data) for name, data in parts if name != DOCUMENT]
+        parts = added([parts[-1]], moved)
     header = min(file.headers, key=lambda one: len(json.dumps(one)))
-    own, table = file.headers.index(header), header.get("array", "u")
-    axis, own_grid = chance.randrange(4), chance.random() < 0.4
-    grid, new = header["dimensions"][axis], []
-    for number in range(chance.choice((30, 200, 700))):
-        node, place = f"n{number}", len(file.headers)
-        dimensions = list(header["dimensions"])
-        ways = {f"{table}/": f"{node}/", f"parts/{own}.": f"parts/{place}."}
-        if own_grid:
-            dimensions[axis] = f"g{number}"
-            ways[f"{grid}/"] = f"g{number}/"
-        array = {"array": node} if "array" in header else {}
-        file.headers.append({**header, "name": node, **array, "dimensions": dimensions})
-        for name, data in parts:
-            for old, way in ways.items():
-                if name.startswith(old):
-                    new.append((way + name.removeprefix(old), data))
+    own, new = f"{header['group']}/", []
+    others, listed = chance.random() < 0.5, chance.random() < 0.3
+    for _ in range(chance.choice((30, 200, 700))):
+        place = len(file.headers)
+        coordinates = header.get("coordinates", {})
+        if others:
+            coordinates = dict.fromkeys(coordinates, file.headers.index(header))
+        elif listed:
+            shape = zip(AXES, header["domain"]["shape"], strict=True)
+            coordinates = {axis: {"values": list(range(n))} for axis, n in shape}
+        named = {"name": f"n{place}", "group": f"v{place}", "coordinates": coordinates}
+        file.headers.append({**header, **named})
+        new += [
+            (f"v{place}/{name.removeprefix(own)}", data)
+            for name, data in parts
+            if name.startswith(own)
+        ]
     if chance.random() < 0.3:
         file.top["required_features"][:0] = ["transform"] * chance.choice((1000, 200_000))
     if chance.random() < 0.3:

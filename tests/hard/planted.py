@@ -30,6 +30,7 @@ FORMAT_TESTS = "tests/golden tests/reference tests/formats/transform tests/forma
 TESTS = {
     "formats/fhash_formats/container/": "tests/formats/container tests/golden",
     "formats/fhash_formats/transform/": FORMAT_TESTS,
+    f"{NATIVE}files/": "tests/formats/container tests/formats/test_libfhash_files.py tests/golden",
     NATIVE: FORMAT_TESTS,
     "fhash_codec/native/": "tests/codec/native tests/codec/measure tests/codec/rendering",
     "fhash_codec/compact/": "tests/codec/compact tests/codec/test_volume.py",
@@ -49,14 +50,16 @@ runpy.run_path("setup.py")
 """
 """Runs setup.py for one library."""
 FAULTS = """
-zip-gap formats/fhash_formats/container/zip_file.py
-if member.offset != position or member.end => if member.end
-zip-crc formats/fhash_formats/container/zip_file.py
-zlib.crc32(data) != member.crc => False
-shard-present formats/fhash_formats/container/array.py
-np.arange(count) < -(-n // chunk) - s * count => np.arange(count) <= -(-n // chunk) - s * count
-shard-beyond formats/fhash_formats/container/array.py
-np.any(table[~present] != ABSENT) => False
+zip-gap formats/fhash_formats/native/files/zip.cpp
+if (member.offset != position || member.end() > end.offset) => if (member.end() > end.offset)
+zip-crc formats/fhash_formats/native/files/zip.cpp
+member.full_size < 0 && crc_32(data, size_t(member.size)) != member.crc => false
+tile-present formats/fhash_formats/native/files/chunks.cpp
+(next && !present(number, i)) => false
+tile-sum formats/fhash_formats/native/files/chunks.cpp
+return position == size || => return true ||
+tiles-together formats/fhash_formats/container/array.py
+range(i * count, min((i + 1) * count, n)) => range(i * count, (i + 1) * count)
 layer-rounding formats/fhash_formats/container/growing.py
 tuple(-(-n // length) for n => tuple(max(n // length, 1) for n
 lost-sync formats/fhash_formats/support/files.py

@@ -6,8 +6,6 @@ All numbers within the network are whole and small enough that their sums are ex
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,46 +59,32 @@ class Head(NamedTuple):
 
 def unpack_head(data: bytes) -> Head:
     """The head of its packed bytes."""
-    count = data[0] - 16
+    count = data[0]
     widths = [*data[1 : 1 + count], 1]
     inputs = [len(OFFSETS) + 2, *widths[:-1]]
     sigma, low, high = (np.float32(v) for v in struct.unpack_from("<3f", data, 1 + count))
     at = 13 + count
-    scales = [struct.unpack_from("<eeB", data, at + 5 * layer) for layer in range(count + 1)]
-    at += 5 * (count + 1)
+    scales = [struct.unpack_from("<ee", data, at + 4 * layer) for layer in range(count + 1)]
+    at += 4 * (count + 1)
     biases = []
     for width in widths:
         biases.append(np.frombuffer(data, np.int8, width, at).astype(np.float32))
         at += width
-    state = int.from_bytes(data[at:], "little")
     layers = []
-    for number, (weight_scale, bias_scale, spread) in enumerate(scales):
+    for number, (weight_scale, bias_scale) in enumerate(scales):
         size = widths[number] * inputs[number]
-        state, weights = pop_weights(state, size, spread)
-        matrix = np.array(weights, np.float32).reshape(widths[number], inputs[number])
+        weights = np.frombuffer(data, np.int8, size, at).astype(np.float32)
+        at += size
+        matrix = weights.reshape(widths[number], inputs[number])
         unit_in = INPUT_UNIT if number == 0 else ACTIVATION_UNIT
         unit_out = sigma if number == count else np.float32(ACTIVATION_UNIT)
         with np.errstate(over="ignore"):
             scale = np.float32(weight_scale / unit_in) * unit_out
             shift = np.float32(bias_scale) * biases[number] * unit_out
         layers.append(Layer(matrix, scale, shift))
-    if state != 1:
-        raise ValueError("the weights of a head do not end where their code ends")
+    if at != len(data):
+        raise ValueError("the weights of a head do not end with its bytes")
     return Head(layers, sigma, low, high)
-
-
-def pop_weights(state: int, count: int, spread: int) -> tuple[int, list[int]]:
-    """Weights from -31 to 31 of one big integer, by asymmetric numeral systems; and the rest."""
-    square = spread * spread
-    frequencies = [1 + (square * square << 16) // (square + w * w) ** 2 for w in range(-31, 32)]
-    sums = [0, *accumulate(frequencies)]
-    weights = []
-    for _ in range(count):
-        quotient, rest = divmod(state, sums[-1])
-        index = bisect_right(sums, rest) - 1
-        state = quotient * frequencies[index] + rest - sums[index]
-        weights.append(index - 31)
-    return state, weights
 
 
 def apply_head(decoded: Floats, head: Head) -> Floats:

@@ -99,8 +99,8 @@ def test_a_plain_file_is_written_and_described(fhash: Fhash, tmp_path: Path) -> 
         }
     info = fhash("info", plain)
     assert info.exit_code == 0, info.output
-    assert "parts/0.tables.level_1 to parts/0.tables.level_" in info.stdout
-    assert "parts/0.occupancy.bits, bytes," in info.stdout
+    assert "tables/level_1 to tables/level_" in info.stdout
+    assert "; occupancy, bytes," in info.stdout
     assert fhash("verify", plain).exit_code == 0
 
 

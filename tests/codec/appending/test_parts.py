@@ -157,7 +157,7 @@ def rewritten(path: Path, change) -> None:
     """Write a part anew, with another header or other errors. change(header, errors) in place."""
     with Container.open(path) as container:
         table, header = container.arrays["tables/level_1"], deepcopy(container.header)
-        errors = container.arrays["steps/errors"].read()
+        errors = container.arrays["step_errors"].read()
         change(header, errors)
         other = path.with_name("other.fhz")
         with ContainerWriter(other) as writer:
@@ -168,7 +168,7 @@ def rewritten(path: Path, change) -> None:
                 settings=table.settings,
                 streams=[bytes(table.coded(index)) for index in np.ndindex(*table.grid)],
             ).write(writer)
-            writer.add_whole("steps/errors", errors)
+            writer.add_whole("step_errors", errors)
             writer.commit(header)
     os.replace(other, path)
 
@@ -183,8 +183,8 @@ def rewritten(path: Path, change) -> None:
         (lambda header, errors: header["part"].update(ssim_steps=3), "ssim_steps"),
         (lambda header, errors: header.update(part=[]), "part"),
         (lambda header, errors: header["model"].pop("gains"), "model.gains"),
-        (lambda header, errors: errors.fill(np.nan), "steps/errors has numbers"),
-        (lambda header, errors: errors.fill(-1), "steps/errors has numbers"),
+        (lambda header, errors: errors.fill(np.nan), "step_errors has numbers"),
+        (lambda header, errors: errors.fill(-1), "step_errors has numbers"),
         *(
             (lambda header, errors, at=at, new=new: errors.__setitem__((0, at), new), "no errors")
             for at, new in ((0, 1e300), (0, 0.5), (1, -1e-9), (2, 1e200), (4, -1.0), (8, 1e9))

@@ -307,7 +307,7 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
         )
         with fhash_codec.open(tmp_path / "a.fhz") as volume:
             assert np.abs(volume[...].astype(np.float64) - source).max() <= 0.01
-            assert (volume.info["model"]["head"] is not None) == (effort == 5)
+            assert (volume.info["mlp"] is not None) == (effort == 5)
         sizes[effort] = figures["bytes"]
     assert sizes[5] < 0.97 * sizes[4]
     # Every stage of the last encoding reported, the trials and the training too.

@@ -37,7 +37,7 @@ from fhash_codec.compact.attempt import (
     region_vertices,
     tiles_to_try,
 )
-from fhash_codec.compact.model import CompactModel, PlainArray, head_of
+from fhash_codec.compact.model import CompactModel, PlainArray
 from fhash_codec.compact.sample import Sample, fill, strata
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
@@ -658,29 +658,6 @@ def test_parts_of_tables_are_parts_of_the_whole_and_integers_are_not_rounded(
         np.testing.assert_array_equal(np.rint(lattice), volume[...])
 
 
-def test_a_head_that_is_no_head_is_damage() -> None:
-    model = {"head": {"widths": [1], "sigma": 1.0, "low": 0.0, "high": 1.0}}
-    assert head_of({"head": None}, {}) is None
-
-    def array(name: str, values: object, scale: float) -> SimpleNamespace:
-        read = np.asarray(values, np.float32)
-        return SimpleNamespace(name=name, attributes={"scale": scale}, read=lambda: read)
-
-    arrays = {
-        "mlp/weight_1": array("mlp/weight_1", np.full((1, 28), 0.5), 0.25),
-        "mlp/bias_1": array("mlp/bias_1", [0.5], 0.25),
-        "mlp/weight_2": array("mlp/weight_2", [[0.5]], 0.25),
-        "mlp/bias_2": array("mlp/bias_2", [0.5], 0.25),
-    }
-    head = head_of(model, arrays)  # type: ignore[arg-type]
-    assert head is not None
-    assert head.layers[0].weights.tolist() == [[2] * 28]
-    for scale, value in ((0.1, 0.55), (0.25, 100.0), (0.25, np.nan), (1e-300, 0.5), (0.2, 0.5)):
-        wrong = {**arrays, "mlp/weight_2": array("mlp/weight_2", [[value]], scale)}
-        with pytest.raises(DamagedFileError, match=r"head|scale"):
-            head_of(model, wrong)  # type: ignore[arg-type]
-
-
 def plain_array(corrections: object, dtype: str, *, tile: int = 2) -> PlainArray:
     """A plain array of the values 0 to 3 along x, without a head."""
     table = np.arange(4, dtype=np.float32).reshape(1, 1, 1, 4, 1)
@@ -689,8 +666,8 @@ def plain_array(corrections: object, dtype: str, *, tile: int = 2) -> PlainArray
         "tables/level_1": SimpleNamespace(shape=table.shape, read=lambda region: table[region]),
         "corrections": SimpleNamespace(read=lambda region: added[region]),
     }
-    model = {"tile": [1, 1, 1, tile], "values": dtype, "head": None, "levels": [[1, 1, 1, 4]]}
-    return PlainArray(model, arrays)  # type: ignore[arg-type]
+    model = {"tile": [1, 1, 1, tile], "values": dtype, "levels": [[1, 1, 1, 4]]}
+    return PlainArray(model, None, arrays)  # type: ignore[arg-type]
 
 
 ALL = (*[slice(0, 1)] * 3, slice(0, 4))

@@ -22,7 +22,6 @@ from fhash_codec.features.bricks import Coreset, build_coreset
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
-from fhash_codec.paper import tables as small_parts
 from fhash_codec.paper.coding import COMMON, MAX_LOSS, WRITINGS, Component, ModelCoding
 from fhash_codec.paper.encode import select
 from fhash_codec.paper.fit import TrainedModel
@@ -137,20 +136,15 @@ def test_layers_that_no_step_keeps_stay_as_they_are() -> None:
     assert quantised[0][0] is original[0][0]
 
 
-@pytest.mark.parametrize("vertices", [1, 5000, 1 << 22])
-def test_the_mask_is_the_occupancy(tmp_path, waves, coded_config, monkeypatch, vertices) -> None:
-    monkeypatch.setattr(small_parts, "MASK_VERTICES", vertices)
+def test_the_bits_are_the_occupancy(tmp_path, waves, coded_config) -> None:
     config = replace(coded_config, epochs=1, features=("interval:50:150",), dilation=0)
     path = tmp_path / "a.fhz"
     fhash_codec.encode(waves(), path, config)
     coreset = select(ArraySeries(waves()), config, silent).coreset
     with Container.open(path) as container:
-        assert "occupancy/bits" not in container.arrays
-        mask = container.arrays["occupancy/mask"].read(
-            tuple(slice(0, n) for n in container.arrays["occupancy/mask"].shape)
-        )
-    for step, bits in zip(mask, coreset.occupancy, strict=True):
-        np.testing.assert_array_equal(step != 0, occupancy.unpack(bits, coreset.box.shape))
+        grids = container.arrays["occupancy"].read()[0]
+    for step, bits in zip(grids, coreset.occupancy, strict=True):
+        np.testing.assert_array_equal(step, bits)
     with fhash_codec.open(path) as volume:
         both = volume.occupancy(0.5)
         np.testing.assert_array_equal(both, volume.occupancy(0) | volume.occupancy(1))
@@ -349,7 +343,7 @@ def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
         assert volume.info["model"]["tables_loss_db"] == coded["tables_loss_db"]
         assert volume.info["model"]["tables"] == "transform"
         assert volume.info["required_features"] == ["transform"]
-        assert "occupancy/mask" in volume.container.arrays
+        assert "occupancy" in volume.container.arrays
         assert coded["bytes"] < 0.75 * exact["bytes"]
         assert volume.verify() == len(volume.info["arrays"])
     with fhash_codec.open(path) as volume, fhash_codec.open(pair["exact"][1]) as other:
@@ -746,7 +740,7 @@ def test_counts_that_are_not_those_of_the_occupancy_are_damage(files, tmp_path) 
     with Container.open(files[1]) as container:
         table = container.arrays["tables/level_1"]
         values, attributes = table.read(), dict(table.attributes)
-        bits = container.arrays["occupancy/bits"].read()
+        bits = container.arrays["occupancy"].read()
     first, *others = attributes["counts"]
     moved = {**attributes, "counts": [first - 1, others[0] + 1, *others[1:]]}
     copied(files[1], tmp_path / "a.fhz", {"tables/level_1": (values, moved)})
@@ -757,7 +751,7 @@ def test_counts_that_are_not_those_of_the_occupancy_are_damage(files, tmp_path) 
     ):
         volume.read(0)
     everywhere = np.full_like(bits, 255)
-    copied(files[1], tmp_path / "b.fhz", {"occupancy/bits": (everywhere, {})})
+    copied(files[1], tmp_path / "b.fhz", {"occupancy": (everywhere, {})})
     with (
         fhash_codec.open(tmp_path / "b.fhz") as volume,
         pytest.raises(DamagedFileError, match="the occupancy asks for"),

@@ -35,23 +35,23 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*Zarr format 3 specification")
 
 
 @pytest.mark.parametrize(
-    ("most", "shard"),
+    ("most", "together"),
     [
-        pytest.param(1 << 30, (6, 6, 12, 12), marks=pytest.mark.every),
-        (2 * 18 * 384, (4, 6, 12, 12)),
-        pytest.param(18 * 384, (2, 6, 12, 12), marks=pytest.mark.every),
-        (9 * 384, (2, 3, 12, 12)),
-        pytest.param(4 * 384, (2, 3, 4, 12), marks=pytest.mark.every),
-        pytest.param(1, (2, 3, 4, 4), marks=pytest.mark.every),
+        pytest.param(1 << 30, (3, 2, 3, 3), marks=pytest.mark.every),
+        (2 * 18 * 384, (2, 2, 3, 3)),
+        pytest.param(18 * 384, (1, 2, 3, 3), marks=pytest.mark.every),
+        (9 * 384, (1, 1, 3, 3)),
+        pytest.param(4 * 384, (1, 1, 1, 3), marks=pytest.mark.every),
+        pytest.param(1, (1, 1, 1, 1), marks=pytest.mark.every),
     ],
 )
-def test_shards_are_of_a_bounded_size_and_keep_steps_in_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, shard: tuple[int, ...]
+def test_members_are_of_a_bounded_size_and_keep_steps_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, together: tuple[int, ...]
 ) -> None:
-    monkeypatch.setattr(module, "SHARD_BYTES", most)
+    monkeypatch.setattr(module, "TOGETHER_BYTES", most)
     with open_coded(write(tmp_path, dataset()), Request()) as (series, array):
         found = Tiles(array, series.source)
-        assert found.shard == shard
+        assert found.metadata.together == together
         told: list[int] = []
         streams = list(found.streams(told.append))
         assert told == list(range(1, 55))
@@ -72,7 +72,7 @@ def test_shards_are_of_a_bounded_size_and_keep_steps_in_order(
 def test_missing_vertices_are_kept_step_by_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    monkeypatch.setattr(module, "SHARD_BYTES", most)
+    monkeypatch.setattr(module, "TOGETHER_BYTES", most)
     data = dataset()
     gaps = np.zeros(SHAPE, bool)
     gaps[1, 2, 3:7] = gaps[4, 5] = True

@@ -11,7 +11,6 @@ from table_files import table_parts
 from fhash_formats.container import ContainerWriter
 
 
-
 def compact_header(samples: Any, shift: float = 0.0) -> dict[str, Any]:
     """The header of a compact variable; its positions of x are `shift` away from the usual."""
     header: dict[str, Any] = samples.compact_header()

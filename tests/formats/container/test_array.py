@@ -53,7 +53,6 @@ DAMAGED = [
     ("shape", [4, 1], "axes"),
     ("data_type", "float64", "zstd declares|asks for float32"),
     ("codecs", {"a": 1}, "codecs"),
-    ("codecs", ["bytes", 5], "codecs"),
     ("attributes", [1], "attributes"),
     ("codecs", ..., "codecs is not a list"),
     ("dimension_names", [1], "dimension_names"),
@@ -66,6 +65,7 @@ UNSUPPORTED = [
     ("codecs.0.configuration.endian", "big", "codecs"),
     ("codecs.2", ..., "codecs"),
     ("codecs", [], "codecs"),
+    ("codecs", ["bytes", 5], "codecs"),
     ("fill_value", 1.0, "fill_value"),
     ("chunk_key_encoding.name", "v2", "chunk_key_encoding"),
     ("chunk_grid.name", "rectangular", "chunk_grid"),
@@ -237,6 +237,7 @@ def test_bytes_of_members_of_tiles(tmp_path, samples) -> None:
 def line(tmp_path, samples):
     """One member of four tiles, of which the last is beyond the end of the array; file, parts."""
     path = write_tiled(tmp_path / "a.fhz", samples, random_values((5,)), (2,), (4,))
+    read_everything(path)  # modules are loaded before memory is measured
     return path, dict(samples.unpack(path.read_bytes()))
 
 
@@ -277,13 +278,16 @@ def test_sizes_that_do_not_fill_their_member(line, samples, case) -> None:
     refused_tiles(path, samples, parts, f"member {NAME}/t/0: the index of its tiles")
 
 
-def test_sizes_that_are_exchanged(line, samples) -> None:
-    """They fill the member, but a tile begins within another one."""
+@pytest.mark.parametrize("moved", [4, ...])
+def test_sizes_that_are_exchanged(line, samples, moved) -> None:
+    """They fill the member, but tiles begin within another one, or have no bytes."""
     path, parts = line
     sizes = np.frombuffer(numcodecs.zstd.decompress(parts[INDEX][:-4]), np.uint32).copy()
-    sizes[:3] += np.array([-4, 8, -4]).astype(np.uint32)
+    moved = sizes[1] if moved is ... else moved
+    sizes[0] += moved
+    sizes[1] -= moved
     parts[INDEX] = PlainCoder(plain_codecs(sizes.dtype), sizes.dtype, (4,)).encode(sizes)
-    refused_tiles(path, samples, parts, f"member {NAME}/t/0: tile [01]: ")
+    refused_tiles(path, samples, parts, f"member {NAME}/t/0: ")
 
 
 @pytest.mark.parametrize("data", [b"", b"abcd", b"x" * 67])

@@ -6,32 +6,28 @@ import copy
 import json
 import random
 import tracemalloc
-import zipfile
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hostile_files import DOCUMENT, ROOT, edited, edited_header, put_at, refused, replaced
-from numcodecs.zstd import compress
+from hostile_files import (
+    CHUNK,
+    DOCUMENT,
+    ROOT,
+    edited,
+    edited_header,
+    put_at,
+    refused,
+    replaced,
+)
 from several_files import write_several
-from table_files import PLAIN, table_parts, write_table
+from table_files import HEAD, table_parts, write_table
 
-from fhash_formats.container import (
-    Container,
-    ContainerWriter,
-    describe_metadata,
-)
-from fhash_formats.container import (
-    record as strict_json,
-)
-from fhash_formats.container.array import ArrayMetadata, plain_codecs, with_crc32c
-from fhash_formats.container.hierarchy import array_path, free_node, shows_values
+from fhash_formats.container import Container, describe_metadata
+from fhash_formats.container import record as strict_json
 from fhash_formats.container.source_entry import MAX_BYTES, MAX_INLINE, check_source, read_metadata
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.series import Coordinate, SourceMetadata, SourceVariable, index_coordinate
-from fhash_formats.transform.spec import MaskLevels
-from fhash_formats.transform.tile_format import TileSettings
 
 
 def extra_array(shape):
@@ -53,34 +49,26 @@ def extra_array(shape):
 
 
 PLACES = {
-    "chunk missing": (
-        lambda p: [part for part in p if part[0] != "time/c/0"],
-        "time has 0 chunks",
-    ),
-    "all but the root missing": (lambda p: p[-1:], "array coords/time is missing"),
+    "chunk missing": (lambda p: [part for part in p if part[0] != CHUNK], "bias_1 has 0 chunks"),
+    "all but the root missing": (lambda p: p[-1:], "array key_frames is missing"),
     "root missing": (lambda p: p[:-1], "zarr.json is missing"),
     "nothing": (lambda p: [], "zarr.json is missing"),
     "group missing": (
-        lambda p: [part for part in p if part[0] != "parts/zarr.json"],
+        lambda p: [part for part in p if part[0] != "mlp/zarr.json"],
         "lies in no group",
     ),
-    "chunk outside the grid": (lambda p: [("time/c/1", b"x"), *p], "time has 2 chunks"),
-    "chunk of other rank": (
-        lambda p: [("time/c/0/0", b"x"), *p],
-        "time has 2 chunks",
-    ),
-    "chunk under another name": (
-        lambda p: [("time/c/00", b"x"), *p],
-        "member time/c/00",
-    ),
+    "chunk outside the grid": (lambda p: [("mlp/bias_1/c/1", b"x"), *p], "bias_1 has 2 chunks"),
+    "chunk of other rank": (lambda p: [(f"{CHUNK}/0", b"x"), *p], "bias_1 has 2 chunks"),
+    "chunk under another name": (lambda p: [(f"{CHUNK}0", b"x"), *p], f"member {CHUNK}0"),
     "chunk number too long": (
-        lambda p: [("time/c/" + "9" * 400, b"x"), *p],
-        "member time/c/999",
+        lambda p: [("mlp/bias_1/c/" + "9" * 400, b"x"), *p],
+        "member mlp/bias_1/c/999",
     ),
     "chunk of no array": (lambda p: [("none/c/0", b"x"), *p], "belongs to no array"),
     "file of no array": (lambda p: [("readme.txt", b"x"), *p], "belongs to no array"),
+    "tiles of no array": (lambda p: [("mlp/bias_1/t/0", b"x"), *p], "belongs to no array"),
     "array in an array": (
-        lambda p: [("time/a/zarr.json", extra_array([1])), *p],
+        lambda p: [("mlp/bias_1/a/zarr.json", extra_array([1])), *p],
         "lies in no group",
     ),
     "many chunks declared": (
@@ -88,7 +76,7 @@ PLACES = {
         "has 0 chunks",
     ),
     "table missing": (
-        lambda p: [part for part in p if not part[0].startswith("parts/0.tables.level_2")],
+        lambda p: [part for part in p if not part[0].startswith("tables/level_2")],
         "tables/level_2 is missing",
     ),
 }
@@ -148,128 +136,43 @@ def test_a_newer_format_is_named_before_its_unknown_codecs(tmp_path, sample, sam
     )
 
 
-@pytest.mark.parametrize(
-    ("wish", "taken", "node"),
-    [
-        ("u", (), "u"),
-        ("u", ("u",), "u_2"),
-        ("u", ("u", "u_2"), "u_3"),
-        ("group/u", (), "group_u"),
-        ("wind speed (m/s)", (), "wind_speed_m_s_"),
-        ("velocity.x", (), "velocity_x"),
-        ("__u", (), "_u"),
-        ("\u00fc", (), "_"),
-        ("parts", (), "parts_2"),
-        ("u" * 300, (), "u" * 80),
-    ],
-)
-def test_names_at_the_root(wish, taken, node) -> None:
-    assert free_node(wish, taken) == node
+def test_names_are_paths_and_documents_lie_together(tmp_path, samples) -> None:
+    """One read finds all documents; the root comes last."""
+    path = write_several(tmp_path / "a.fhz", samples)
+    names = [name for name, _ in samples.unpack(path.read_bytes())]
+    documents = [name for name in names if name.endswith("zarr.json")]
+    assert names[-len(documents) :] == documents
+    assert documents[-1] == ROOT
+    with Container.open(path) as file:
+        for number, variable in enumerate(file.variables.values()):
+            assert variable.header["group"] == f"v{number}"
+            for name, array in variable.arrays.items():
+                # An array beside the data that an earlier variable has lies with that.
+                assert array.name in (f"v{number}/{name}", f"v0/{name}")
+    path = write_table(tmp_path / "b.fhz", samples.compact_header(), table_parts())
+    with Container.open(path) as one:
+        assert [array.name for array in one.arrays.values()] == list(one.arrays)
+        assert "group" not in one.header
 
 
-def test_places_of_parts_are_told_apart() -> None:
-    assert array_path(0, "mlp/weight_1") == "parts/0.mlp.weight_1"
-    places = [array_path(7, name) for name in ("a/b.c", "a.b/c", "a/b/c", "a.b.c")]
-    assert places == ["parts/7.a.b..c", "parts/7.a..b.c", "parts/7.a.b.c", "parts/7.a..b..c"]
-
-
-SHAPE = (4, 3, 4, 6)
-
-
-def table(dtype: str, settings: TileSettings | None) -> ArrayMetadata:
-    configuration = {} if settings is None else {"settings": settings.to_text()}
-    return ArrayMetadata(
-        shape=SHAPE,
-        dtype=np.dtype(dtype),
-        chunk_shape=SHAPE,
-        codecs=[{"name": "fhash.transform", "configuration": configuration}],
-    )
-
-
-def test_a_table_is_hidden_where_its_codec_lacks_something() -> None:
-    with_mask = replace(PLAIN, mask=MaskLevels())
-    assert shows_values(table("f4", PLAIN))
-    assert shows_values(table("i2", PLAIN))
-    assert shows_values(table("f4", with_mask))
-    assert not shows_values(table("i2", with_mask))
-    assert shows_values(table("f4", None))  # each tile has settings of its own
-    assert not shows_values(table("i2", None))
-    numbers = replace(table("f4", None), codecs=plain_codecs(np.dtype("f4")))
-    assert not shows_values(numbers)
-
-
-def test_one_variable_has_the_names_of_its_source(tmp_path, samples) -> None:
-    with ContainerWriter(tmp_path / "a.fhz") as writer:
-        writer.begin({"name": "surface/rain rate", "units": "K", "attributes": {"flag": 1}})
-        assert writer.name_axes(["time", "z", "lat", "lat"], (4, 3, 5, 6)) == [
-            *("time", "z", "lat", "lat_2")
-        ]
-        writer.add_whole("coords/x", np.arange(6.0), attributes={"units": "m", "name": "lat"})
-        table_parts().write(writer)
-        header = samples.compact_header()
-        del header["coordinates"]["x"]
-        writer.commit(header)
-    with Container.open(tmp_path / "a.fhz") as container:
-        assert list(container.arrays) == ["coords/x", "tables/level_1"]
-        table, x = container.arrays["tables/level_1"], container.coordinate("x")
-        assert (table.name, dict(table.attributes)) == ("surface_rain_rate", {"units": "K"})
-        assert table.dimension_names == ("time", "z", "lat_box", "lat_2")
-        assert (container.arrays["coords/x"].name, x.name) == ("lat_2", "lat")
-        assert container.coordinate("y").name == "lat"
-        assert (container.names, container.variable) == (["density"], None)
-        assert container.header["dimensions"] == ["time", "z", "lat", "lat_2"]
-
-
-def test_an_array_at_the_root_never_stands_for_one_of_the_format(tmp_path, samples) -> None:
-    """Its path is the name of another one, and it is of another shape."""
-    path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts())
-    parts = samples.unpack(path.read_bytes())
-    document = json.loads(dict(parts)["values/zarr.json"])
-    document |= {"shape": [1, 2], "codecs": plain_codecs(np.dtype("f4"))}
-    del document["dimension_names"]
-    document["chunk_grid"]["configuration"]["chunk_shape"] = [1, 2]
-    coded = with_crc32c(compress(np.zeros((1, 2), "<f4"), 1))
-    added = [("key_frames/zarr.json", json.dumps(document).encode()), ("key_frames/c/0/0", coded)]
-    path.write_bytes(samples.pack([*added, *parts]))
-    with Container.open(path) as container:
-        assert set(container.arrays) == {"/key_frames", "tables/level_1"}
-        assert container.verify() == 2
-
-
-FIRST, META = "attributes.fhash.variables.0", "consolidated_metadata.metadata"
+FIRST, HEADS = "attributes.fhash.variables.0", "attributes.fhash.variables.0.mlp"
 ROOTS = {
     "no list": ("attributes.fhash.variables", {}, "a list of at least one object"),
     "an empty list": ("attributes.fhash.variables", [], "a list of at least one object"),
     "a list of numbers": ("attributes.fhash.variables", [1], "variables is not objects"),
     "a name that is no text": (f"{FIRST}.name", 5, "name is not a text"),
     "a name twice": (f"{FIRST}.name", "w", "names that stand once"),
-    "an array in a group": (f"{FIRST}.array", "a/b", "a name that no other has"),
-    "an array with a dot": (f"{FIRST}.array", "a.b", "a name that no other has"),
-    "the group of parts": (f"{FIRST}.array", "parts", "a name that no other has"),
-    "an array twice": (f"{FIRST}.array", "w", "variable 'w': .*array is not"),
-    "an array that is not there": (f"{FIRST}.array", "q", "array tables/level_1 is missing"),
-    "no array": (f"{FIRST}.array", ..., "array tables/level_1 is missing"),
-    "three dimensions": (f"{FIRST}.dimensions", ["time", "z", "y"], "four different"),
-    "a dimension twice": (f"{FIRST}.dimensions", ["time", "z", "y", "y"], "four different"),
-    "a dimension in a group": (
-        f"{FIRST}.dimensions",
-        ["time", "z", "y", "parts/u"],
-        "four different",
-    ),
-    "a dimension that is a variable": (
-        f"{FIRST}.dimensions",
-        ["time", "z", "y", "w"],
-        "a name that a variable has",
-    ),
-    "a dimension that is not there": (
-        f"{FIRST}.dimensions",
-        ["time", "z", "y", "q"],
-        "array coords/x is missing",
-    ),
-    "a dimension of another length": (
-        f"{FIRST}.dimensions",
-        ["z", "time", "y", "lon_deg_"],
-        "variable 'u': array coords/time is",
+    "no group": (f"{FIRST}.group", ..., "variable 'u': header key group"),
+    "a group of another": (f"{FIRST}.group", "v1", "variable 'u': header key group"),
+    "a group of no number": (f"{FIRST}.group", 0, "variable 'u': header key group"),
+    "coordinates of no variable": (f"{FIRST}.coordinates.x", 3, "'u': header key coordinates"),
+    "coordinates of itself": (f"{FIRST}.coordinates.x", 0, "'u': header key coordinates"),
+    "coordinates in a ring": (f"{FIRST}.coordinates.z", 1, "'u': header key coordinates"),
+    "coordinates of a fraction": (f"{FIRST}.coordinates.x", 0.5, "'u': header key coordinates"),
+    "coordinates of another length": (
+        f"{FIRST}.coordinates.y",
+        {"values": [0, 1]},
+        "variable 'u': header key coordinates",
     ),
     "a feature that the root lacks": ("attributes.fhash.required_features", [], "'u': .*features"),
     "a wrong header": (f"{FIRST}.dilation", -1, "variable 'u': header key dilation"),
@@ -299,16 +202,30 @@ ROOTS = {
         {"auxiliary/a": [2, "auxiliary/b"]},
         "auxiliary/a is missing",
     ),
-    "other documents at the root": (
-        f"{META}.u.fill_value",
-        1,
-        "consolidated_metadata has other documents",
+    "no MLP": (HEADS, ..., "variable 'u': .*lack that of the header"),
+    "an MLP that the settings do not have": (
+        "attributes.fhash.variables.2.mlp",
+        HEAD.to_json(),
+        "variable 'w': .*lack that of the header",
     ),
-    "a document less at the root": (
-        f"{META}.parts",
-        ...,
-        "consolidated_metadata has other documents",
-    ),
+    "an MLP that is text": (HEADS, "AAAA", "variable 'u': header key mlp"),
+    "no widths": (f"{HEADS}.widths", ..., r"header key mlp\.widths"),
+    "four widths": (f"{HEADS}.widths", [3, 3, 3, 3], r"header key mlp\.widths"),
+    "other widths": (f"{HEADS}.widths", [4], r"header key mlp\.scales|header key mlp"),
+    "a wide layer": (f"{HEADS}.widths", [65], r"header key mlp\.widths"),
+    "sigma of text": (f"{HEADS}.sigma", "1", r"header key mlp\.sigma"),
+    "sigma of 0": (f"{HEADS}.sigma", 0, "header key mlp: "),
+    "a range of one": (f"{HEADS}.range", [1.0], r"header key mlp\.range"),
+    "a range that falls": (f"{HEADS}.range", [1.0, 0.0], "header key mlp: "),
+    "a scale less": (f"{HEADS}.scales", [1.0] * 3, r"header key mlp\.scales"),
+    "a scale of 0": (f"{HEADS}.scales.1", 0, "header key mlp: "),
+    "a scale beyond float16": (f"{HEADS}.scales.1", 1e9, "header key mlp: "),
+    "a bias less": (f"{HEADS}.biases", [0, 1, 2], r"header key mlp\.biases"),
+    "a large bias": (f"{HEADS}.biases.0", 128, r"header key mlp\.biases"),
+    "weights that are a list": (f"{HEADS}.weights", [1], r"header key mlp\.weights"),
+    "weights beyond the letters": (f"{HEADS}.weights", "/" * 87, r"header key mlp\.weights"),
+    "a weight less": (f"{HEADS}.weights", "A" * 86, "header key mlp: "),
+    "a weight more": (f"{HEADS}.weights", "A" * 88, "header key mlp: "),
 }
 
 
@@ -319,50 +236,41 @@ def test_headers_that_are_refused(tmp_path, samples, case) -> None:
     refused(path, edited(path, samples, ROOT, lambda root: put_at(root, place, value)), message)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("parts/3.a", "belongs to no variable"),
-        ("parts/00.a", "belongs to no variable"),
-        ("parts/u.a", "belongs to no variable"),
-        ("parts/0", "belongs to no variable"),
-        ("parts/0.", "belongs to no variable"),
-        ("parts/2.coords.x", "belongs to no variable"),
-        ("parts/0.tables.level_1", "is there twice"),
-    ],
-)
-def test_arrays_that_belong_to_no_variable(tmp_path, samples, name, message) -> None:
+def test_an_mlp_stands_once(tmp_path, samples) -> None:
+    """Not in the settings of the table as well."""
+    path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts())
+    whole = table_parts().settings.to_text()
+    place = "attributes.tiles.settings"
+    data = edited(path, samples, "tables/level_1/zarr.json", lambda v: put_at(v, place, whole))
+    refused(path, data, "they have a head of their own")
+
+
+@pytest.mark.parametrize("name", ["a", "v3", "v00/a", "v0a", "u/tables/level_1"])
+def test_arrays_that_belong_to_no_variable(tmp_path, samples, name) -> None:
+    """They are checked as all are, but no variable has them."""
     path = write_several(tmp_path / "a.fhz", samples, paper=False)
     parts = samples.unpack(path.read_bytes())
-    copies = [(n.replace("time/", f"{name}/"), d) for n, d in parts if n.startswith("time/")]
-    root = json.loads(parts[-1][1])
-    document = next(data for member, data in copies if member.endswith("zarr.json"))
-    root["consolidated_metadata"]["metadata"][name] = json.loads(document)
-    data = samples.pack([*copies, *parts[:-1], (ROOT, json.dumps(root).encode())])
-    refused(path, data, message)
-
-
-def test_a_document_that_the_root_repeats_is_checked_as_well(tmp_path, samples) -> None:
-    """It is not read at opening; a library of Zarr may read it."""
-    path = write_several(tmp_path / "a.fhz", samples)
-    with zipfile.ZipFile(path) as file:
-        documents = [each for each in file.infolist() if each.filename.endswith("/zarr.json")]
-    sound = path.read_bytes()
-    for each in documents:
-        damaged = bytearray(sound)
-        damaged[each.header_offset + 30 + len(each.filename) + each.compress_size // 2] ^= 4
-        path.write_bytes(damaged)
-        with (
-            pytest.raises(DamagedFileError, match=f"member {each.filename}: "),
-            Container.open(path) as container,
-        ):
-            container.verify()
+    source = "v0/auxiliary/area/"
+    copies = [(n.replace(source, f"{name}/"), data) for n, data in parts if n.startswith(source)]
+    group = json.dumps({"zarr_format": 3, "node_type": "group"}).encode()
+    folders = [name.rsplit("/", k)[0] for k in range(1, name.count("/") + 1)]
+    groups = [(f"{folder}/zarr.json", group) for folder in folders]
+    path.write_bytes(samples.pack([*copies, *groups, *parts]))
+    with Container.open(path) as file:
+        assert file.verify() == len(file.arrays) == 6
+        assert not file.arrays[name].read().any()
+        for variable in file.variables.values():
+            assert name not in {array.name for array in variable.arrays.values()}
 
 
 def test_a_missing_chunk_of_any_variable_is_refused(tmp_path, samples) -> None:
     path = write_several(tmp_path / "a.fhz", samples)
     parts = samples.unpack(path.read_bytes())
-    for missing in ("w/c/0/0/0/0", "parts/0.auxiliary.area/c/0/0", "parts/3.key_frames/c/0"):
+    for missing in (
+        *("v2/tables/level_1/t/0", "v2/tables/level_1/c/0/0/0/0"),
+        *("v0/auxiliary/area/c/0/0", "v3/key_frames/c/0"),
+    ):
+        assert missing in dict(parts)
         data = samples.pack([part for part in parts if part[0] != missing])
         refused(path, data, "chunks|is missing")
 

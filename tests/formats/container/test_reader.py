@@ -14,11 +14,11 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numcodecs.zstd
 import numpy as np
 import pytest
-from hostile_files import DOCUMENT, edited, edited_header, read_everything, refused, replaced
+from hostile_files import edited_header, read_everything, refused, replaced
 from rarely import rarely
-from several_files import PLAIN_VARIABLE, add_coordinates, compact_header, write_several
-from sharded_files import NAME, random_values, write_sharded
+from several_files import compact_header, write_several
 from table_files import table_parts, write_table
+from tiled_files import CODECS, NAME, random_values, write_tiled
 
 from fhash_formats.container import FORMAT_VERSION, Container, ContainerWriter, is_container
 from fhash_formats.container.header import complete
@@ -27,15 +27,13 @@ from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 from fhash_formats.native import crc32c
 
 ARRAYS = {
-    "coords/time": lambda a: a[:-1],
-    "coords/z": lambda a: a.astype("float32"),
     "key_frames": lambda a: a[:1],
     "tables/level_1": lambda a: a[..., :1],
     "tables/level_2": lambda a: a.astype("float32"),
     "mlp/weight_1": lambda a: np.ascontiguousarray(a.T),
     "mlp/bias_1": lambda a: a[:, None],
     "mlp/weight_2": lambda a: a.astype("float64"),
-    "occupancy/bits": lambda a: a[..., :-1],
+    "occupancy": lambda a: a[..., :-1],
 }
 
 
@@ -51,30 +49,12 @@ def test_array_that_does_not_fit_is_named(tmp_path, samples, name) -> None:
         samples.write(tmp_path / "a.fhz", header, arrays)
 
 
-def test_a_mask_may_stand_in_place_of_the_bits(tmp_path, samples) -> None:
-    header = samples.header()
-    arrays = samples.arrays(header)
-    del arrays["occupancy/bits"]
-    mask = np.ones(header["model"]["levels"][0], np.uint8)
-    samples.write(tmp_path / "a.fhz", header, arrays | {"occupancy/mask": mask})
-    with Container.open(tmp_path / "a.fhz") as container:
-        assert container.verify() == len(arrays) + 1
-    for other in (mask[1:], mask.astype(np.int16)):
-        with pytest.raises(InputError, match=r"array occupancy/mask is .* the header asks for"):
-            samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": other})
-    with pytest.raises(InputError, match="is there beside occupancy/bits"):
-        samples.write(tmp_path / "b.fhz", header, samples.arrays(header) | {"occupancy/mask": mask})
-    header["features"] = [f"isosurface:{n}" for n in range(9)]
-    with pytest.raises(InputError, match="of more than 8 features"):
-        samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": mask})
-
-
 def test_the_bits_have_a_grid_of_each_feature(tmp_path, samples) -> None:
     header = samples.header()
     header["features"] = ["isosurface:0", "isosurface:1"]
     arrays = samples.arrays(header)
     samples.write(tmp_path / "a.fhz", header, arrays)
-    arrays["occupancy/bits"] = arrays["occupancy/bits"][:1]
+    arrays["occupancy"] = arrays["occupancy"][:1]
     with pytest.raises(InputError, match=r"the header asks for uint8 \(2, 2, 16\)"):
         samples.write(tmp_path / "b.fhz", header, arrays)
 
@@ -135,31 +115,19 @@ def test_components_need_their_mixing(tmp_path, samples, mixing) -> None:
 
 def test_arrays_of_other_names_are_ignored(tmp_path, samples) -> None:
     header = samples.header()
-    others = {"tables/novelty": np.zeros(3, np.uint8), "coords/novelty": np.zeros(3)}
+    others = {"tables/novelty": np.zeros(3, np.uint8), "t": np.zeros(3), "c": np.zeros(3)}
     arrays = samples.arrays(header) | others
-    samples.write(tmp_path / "a.fhz", header, arrays, {"coords/novelty": {"name": 5}})
+    samples.write(tmp_path / "a.fhz", header, arrays)
     with Container.open(tmp_path / "a.fhz") as container:
         assert container.verify() == len(container.arrays) == len(arrays)
 
 
-def test_name_of_a_coordinate_is_text(sample, samples) -> None:
-    data = edited(sample, samples, DOCUMENT, lambda v: v.update(attributes={"name": 5}))
-    refused(sample, data, "array coords/time attribute name is 5")
-
-
-def test_shards_need_the_feature(tmp_path, samples) -> None:
+def test_tiles_need_the_feature(tmp_path, samples) -> None:
     header = samples.header()
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         for name, array in samples.arrays(header).items():
             writer.add_whole(name, array)
-        writer.add_array(
-            NAME,
-            shape=(2,),
-            dtype="uint8",
-            chunk_shape=(1,),
-            shard_shape=(2,),
-            chunks=[np.zeros(1, np.uint8)] * 2,
-        )
+        writer.add_whole(NAME, np.zeros(2, np.uint8), codecs=CODECS)
         with pytest.raises(
             InputError, match="array extra/values has codecs of the feature transform"
         ):
@@ -177,7 +145,7 @@ def compact_arrays(key_frames=4, dtype="float32"):
 OPTIONAL = {
     "nothing": {},
     "key frames": {"key_frames": np.arange(4)},
-    "missing": {"missing/bits": np.zeros((4, 12), dtype=np.uint8)},
+    "missing": {"missing": np.zeros((4, 12), dtype=np.uint8)},
 }
 
 
@@ -216,7 +184,6 @@ def test_header_comes_back(sample, samples) -> None:
     with Container.open(sample) as container:
         assert container.header == {
             **complete(samples.header()),
-            "dimensions": ["time", "z", "y", "x"],
             "format": "fhash",
             "format_version": list(FORMAT_VERSION),
             "required_features": [],
@@ -287,7 +254,7 @@ def test_another_file_is_refused(tmp_path, content) -> None:
 def test_key_frames_increase_within_the_domain(sample, samples, steps) -> None:
     coded = numcodecs.zstd.compress(np.array(steps, dtype="<i8"), 1)
     coded += struct.pack("<I", crc32c(coded))
-    refused(sample, replaced(sample, samples, "parts/0.key_frames/c/0", coded), "key_frames")
+    refused(sample, replaced(sample, samples, "key_frames/c/0", coded), "key_frames")
 
 
 def values(container: Container) -> np.ndarray:
@@ -369,9 +336,7 @@ def test_an_open_file_stays_open(sample, expected, kind) -> None:
 
 
 def test_an_open_file_that_is_cut(tmp_path, samples) -> None:
-    path = write_sharded(
-        tmp_path / "a.fhz", samples, random_values((99, 999)), (99, 333), (99, 999)
-    )
+    path = write_tiled(tmp_path / "a.fhz", samples, random_values((99, 999)), (99, 333), (1, 3))
     file = io.BytesIO(path.read_bytes())
     container = Container.open(file)
     file.truncate(100)
@@ -439,9 +404,7 @@ def test_a_tail_that_is_cut_short_names_the_file(sample, monkeypatch) -> None:
 
 @pytest.mark.parametrize("validators", [True, False])
 def test_damage_is_told_as_a_change(tmp_path, samples, range_server, validators) -> None:
-    path = write_sharded(
-        tmp_path / "a.fhz", samples, random_values((99, 999)), (99, 333), (99, 999)
-    )
+    path = write_tiled(tmp_path / "a.fhz", samples, random_values((99, 999)), (99, 333), (1, 3))
     range_server.conditions = range_server.range_conditions = False
     range_server.validators = validators
     data = path.read_bytes()
@@ -459,7 +422,7 @@ def test_damage_without_a_change_is_damage(sample, range_server) -> None:
     data[offset] ^= 1
     with (
         Container.open(range_server.put("run.fhz", bytes(data))) as container,
-        pytest.raises(DamagedFileError, match=r"run\.fhz: member parts/0\.mlp\.weight_1"),
+        pytest.raises(DamagedFileError, match=r"run\.fhz: member mlp/weight_1"),
     ):
         values(container)
 
@@ -569,29 +532,20 @@ def test_each_variable_is_what_a_file_of_its_own_would_be(tmp_path, samples) -> 
 
 def test_coordinates_are_there_once_and_others_have_their_own(tmp_path, samples) -> None:
     with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
-        shared = [name for name in file.arrays if "parts" not in name]
-        assert shared == ["time", "z", "y", "lon_deg_", "u", "group_v", "lon_deg__of_w", "w"]
+        assert list(file.arrays) == [
+            *("v0/auxiliary/area", "v0/tables/level_1", "v1/tables/level_1"),
+            *("v2/auxiliary/area", "v2/tables/level_1"),
+        ]
+        headers = [each["coordinates"] for each in file.header["variables"]]
+        assert headers[1] == {"time": 0, "z": 0, "y": 0, "x": 0}
+        assert headers[2] == headers[1] | {"x": headers[0]["x"] | {"start": 0.25}}
         u, v, w = file.variables.values()
-        for axis in ("time", "z", "y"):
-            assert u.arrays[f"coords/{axis}"] is w.arrays[f"coords/{axis}"]
-        assert u.arrays["coords/x"] is v.arrays["coords/x"] is not w.arrays["coords/x"]
+        assert u.header["coordinates"] == v.header["coordinates"]
         assert u.coordinate("x").name == w.coordinate("x").name == "lon (deg)"
         assert u.coordinate("time").name == "time"
         assert (w.coordinate("x").values - u.coordinate("x").values).tolist() == [0.25] * 6
-        assert u.coordinate("z").attributes == {"units": "m"}
+        assert v.coordinate("z").attributes == {"units": "m"}
         assert file.attributes == {"title": "four winds"}
-
-
-def test_arrays_show_the_axes_that_are_whole(tmp_path, samples) -> None:
-    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
-        # The box of the samples has 4 of 5 vertices along y.
-        names = file.arrays["u"].dimension_names, file.arrays["w"].dimension_names
-        assert names == (
-            ("time", "z", "y_box", "lon_deg_"),
-            ("time", "z", "y_box_3", "lon_deg__of_w"),
-        )
-        assert file.arrays["u"].attributes == {"units": "m s-1"}
-        assert file.arrays["lon_deg_"].dimension_names == ("lon_deg_",)
 
 
 def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
@@ -599,8 +553,7 @@ def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
     with ContainerWriter(tmp_path / "a.fhz", variables=["u", "v"]) as writer:
         for seed, _ in enumerate("uv"):
             parts = table_parts(seed=seed)
-            writer.begin(PLAIN_VARIABLE)
-            add_coordinates(writer)
+            writer.begin()
             mark = writer.mark()
             for _ in range(2):  # once more after a rewinding
                 writer.rewind(mark)
@@ -608,7 +561,7 @@ def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
                 header = compact_header(samples)
                 sizes.append(writer.size(header))
                 with writer.preview(header) as preview:
-                    assert preview.verify() == 5
+                    assert preview.verify() == 1
             writer.finish(header)
         size = writer.commit()
     assert sizes[0] == sizes[1]
@@ -633,7 +586,7 @@ def test_variables_do_not_share_cached_chunks(tmp_path, samples) -> None:
         file.variables["w"].arrays["tables/level_1"].read()
         file.variables["u"].closing_file().close()
         with pytest.raises(InputError, match="closed"):
-            file.variables["w"].arrays["coords/x"].read()
+            file.variables["w"].arrays["auxiliary/area"].read()
 
 
 @pytest.mark.parametrize("names", [[""], ["u", "u"]])
@@ -644,35 +597,17 @@ def test_names_must_differ(tmp_path, names) -> None:
 
 def test_a_variable_alone_is_not_committed(tmp_path) -> None:
     with ContainerWriter(tmp_path / "a.fhz", variables=["u"]) as writer:
-        writer.begin(PLAIN_VARIABLE)
+        writer.begin()
         with pytest.raises(InputError, match="finish each and commit them"):
             writer.commit({})
     assert not (tmp_path / "a.fhz").exists()
-
-
-def test_a_coordinate_never_takes_the_place_of_a_variable(tmp_path, samples) -> None:
-    names = ["u", "z", "y_box", "parts"]
-    with ContainerWriter(tmp_path / "a.fhz", variables=names) as writer:
-        for seed, _ in enumerate(names):
-            writer.begin(PLAIN_VARIABLE)
-            add_coordinates(writer)
-            table_parts(seed=seed).write(writer)
-            writer.finish(compact_header(samples))
-        writer.commit()
-    with Container.open(tmp_path / "a.fhz") as file:
-        assert file.arrays["z"].shape == (4, 3, 4, 6)
-        assert file.arrays["z_of_u"].dimension_names == ("z_of_u",)
-        assert file.arrays["u"].dimension_names == ("time", "z_of_u", "y_box_2", "lon_deg_")
-        assert file.arrays["parts_2"].shape == (4, 3, 4, 6)
-        assert all(v.coordinate("z").name == "z" for v in file.variables.values())
 
 
 def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, samples) -> None:
     path, places = tmp_path / "a.fhz", np.arange(30.0).reshape(5, 6)
     with ContainerWriter(path, variables=["u", "v", "w"]) as writer:
         for name in "uvw":
-            writer.begin(PLAIN_VARIABLE)
-            add_coordinates(writer)
+            writer.begin()
             writer.add_whole("auxiliary/lat", places + (name == "w"))
             if name != "u":
                 writer.add_whole(f"auxiliary/lat_{name}", places)
@@ -681,7 +616,7 @@ def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, sa
         writer.commit()
     with Container.open(path) as file:
         lat = [name for name in file.arrays if "lat" in name]
-        assert lat == ["parts/0.auxiliary.lat", "parts/2.auxiliary.lat"]
+        assert lat == ["v0/auxiliary/lat", "v2/auxiliary/lat"]
         u, v, w = (each.arrays["auxiliary/lat"] for each in file.variables.values())
         assert u is v
         assert (w.read() - u.read() == 1).all()
@@ -702,7 +637,7 @@ def test_arrays_beside_the_data_are_coded_as_differences_where_that_is_smaller(
     rough = np.frombuffer(np.random.default_rng(5).bytes(2000 * smooth.itemsize), kind)
     header = samples.header()
     with ContainerWriter(tmp_path / "a.fhz") as writer:
-        writer.begin(PLAIN_VARIABLE)
+        writer.begin()
         for name, values in samples.arrays(header).items():
             writer.add_whole(name, values)
         writer.add_whole("auxiliary/smooth", smooth)
@@ -722,19 +657,17 @@ def test_the_bytes_of_a_file_are_split_without_a_rest(tmp_path, samples) -> None
     path = write_several(tmp_path / "a.fhz", samples)
     with Container.open(path) as file:
         parts = file.split()
-        assert list(parts) == ["field", "coordinates", "beside", "model", "index"]
+        assert list(parts) == ["field", "beside", "model", "index"]
         assert sum(parts.values()) == file.size == path.stat().st_size
-        areas = [array for name, array in file.arrays.items() if name.endswith(".area")]
+        areas = [array for name, array in file.arrays.items() if name.endswith("/area")]
         assert parts["beside"] == sum(array.nbytes_stored for array in areas) > 0
-        positions = ("time", "z", "y", "lon_deg_")
-        assert parts["coordinates"] > sum(file.arrays[name].nbytes_stored for name in positions)
         each = {name: variable.split() for name, variable in file.variables.items()}
         for name, variable in file.variables.items():
             assert sum(each[name].values()) == variable.size
         for part in ("field", "beside", "model"):
             assert sum(found[part] for found in each.values()) == parts[part]
         assert each["u"]["field"] == file.variables["u"].arrays["tables/level_1"].nbytes_stored
-        assert each["u"]["model"] > each["w"]["model"] > 0, "u has a head"
+        assert min(each["u"]["model"], each["w"]["model"]) > 0
         weights = sum(
             array.nbytes_stored
             for name, array in file.variables["paper"].arrays.items()

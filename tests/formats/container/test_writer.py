@@ -24,11 +24,11 @@ from growing_file import (
     streams_of,
 )
 from rarely import rarely
-from sharded_files import chunk_of, random_values, write_sharded
 from table_files import table_parts
+from tiled_files import CODECS, chunk_of, random_values, tiled, tiles_of, write_tiled
 
-from fhash_formats.container import Container, ContainerWriter, shard_order
-from fhash_formats.container import array as sharding
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container import array as coding
 from fhash_formats.container.growing import GrowingContainer, TableParts
 from fhash_formats.container.writer import cut
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
@@ -179,7 +179,7 @@ def test_half_an_array_cannot_be_committed(tmp_path, samples) -> None:
         fill(writer, samples, header)
         with pytest.raises(InputError):
             writer.add_array("extra", **{**GOOD, "chunks": GOOD["chunks"][:1]})
-        with pytest.raises(InputError, match="extra has 1 chunks; another number"):
+        with pytest.raises(InputError, match="member extra/c/0 belongs to no array"):
             writer.commit(header)
 
 
@@ -231,19 +231,21 @@ def test_chunks_of_one_array_may_come_from_a_generator(tmp_path, samples) -> Non
         assert container.arrays["tables/level_1"].dtype == np.dtype("float16")
 
 
-def test_no_more_than_one_shard_is_held(tmp_path, samples) -> None:
-    """While a shard is given, those before it are in the file."""
+def test_no_more_than_one_member_is_held(tmp_path, samples) -> None:
+    """While a member is given, those before it are in the file."""
+    coder = tiled(np.zeros((1, 1 << 16), np.uint8), (1, 1 << 16)).coder
     values = np.random.default_rng(0).integers(0, 256, (16, 1 << 16), dtype=np.uint8)
+    streams = [coder.encode(row[None]) for row in values]
 
     def chunks():
-        for i in range(16):
+        for i, stream in enumerate(streams):
             if i == 15:
                 assert tracemalloc.get_traced_memory()[0] - begun < 3 << 17
-            yield values[i : i + 1]
+            yield bytes(bytearray(stream))
 
     tracemalloc.start()
     begun = tracemalloc.get_traced_memory()[0]
-    write_sharded(tmp_path / "a.fhz", samples, values, (1, 1 << 16), (2, 1 << 16), chunks=chunks())
+    write_tiled(tmp_path / "a.fhz", samples, values, (1, 1 << 16), (2, 1), chunks=chunks())
     tracemalloc.stop()
 
 
@@ -296,17 +298,14 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
     header["config"] = {f"setting_{n}": 1.5 for n in range(16)}
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         tile = np.zeros((21, 32, 32, 64), dtype=np.float32)
-        settings = {
-            "shape": (steps, 64, 64, 128),
-            "chunk_shape": tile.shape,
-            "shard_shape": (steps, 64, 64, 128),
-        }
         writer.add_array(
             "tables/level_1",
+            shape=(steps, 64, 64, 128),
             dtype=tile.dtype,
+            chunk_shape=tile.shape,
+            together=(1, 2, 2, 2),
             chunks=[tile] * 8,
-            dimension_names=["t", "z", "y", "x"],
-            **settings,
+            codecs=CODECS,
         )
         size = writer.commit(header)
     with Container.open(tmp_path / "a.fhz") as container:
@@ -374,7 +373,7 @@ def test_the_chunks_of_an_array_are_all_of_it_in_order(chunk_shape) -> None:
 BAD_CHUNKS = {
     "too few": (lambda given: given[:-1], "was not given"),
     "too many": (lambda given: [*given, given[0]], "more chunks"),
-    "of a later shard": (lambda given: [((2, 0), given[4])], r"chunk \(2, 0\) is none of shard"),
+    "of a later member": (lambda given: [((2, 0), given[4])], r"chunk \(2, 0\) is none of member"),
     "twice": (lambda given: [((0, 0), given[0]), ((0, 0), given[0])], "given twice"),
     "in order after all": (lambda given: [((0, 1), given[1]), given[0], given[0]], "given twice"),
     "other type": (lambda given: [given[0].astype(np.float64)], r"float64 \(2, 3\)"),
@@ -386,9 +385,9 @@ BAD_CHUNKS = {
 def test_chunks_that_do_not_fit(tmp_path, samples, case) -> None:
     change, message = BAD_CHUNKS[case]
     values = random_values((7, 6))
-    given = [chunk_of(values, index, (2, 3)) for index in shard_order((7, 6), (2, 3), (4, 6))]
+    given = [chunk_of(values, at, (2, 3)) for at in tiles_of(tiled(values, (2, 3), (2, 2)))]
     with pytest.raises(InputError, match=message):
-        write_sharded(tmp_path / "a.fhz", samples, values, (2, 3), (4, 6), chunks=change(given))
+        write_tiled(tmp_path / "a.fhz", samples, values, (2, 3), (2, 2), chunks=change(given))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -399,7 +398,7 @@ def names(folder: Path) -> list[str]:
     return sorted(os.listdir(folder))
 
 
-@pytest.mark.parametrize("frame", [FRAME, (3, 4, 4)], ids=["shards", "single tiles"])
+@pytest.mark.parametrize("frame", [FRAME, (3, 4, 4)], ids=["several tiles", "single tiles"])
 def test_after_every_layer_the_file_is_complete(tmp_path, frame) -> None:
     path = tmp_path / "a.fhz"
     with GrowingContainer(path) as growing:
@@ -457,10 +456,8 @@ def test_an_end_that_later_ones_took_the_place_of_is_that_of_its_time(tmp_path) 
             growing.add_layer(array, number, streams_of(layer_values(number)))
             mark = growing.mark()
             growing.describe(array, 2 * number + 2)
-            times = np.arange(2.0 * number + 2) ** 2
-            growing.add_whole("coords/time", times, attributes={"name": "t"})
             header = growing_header(2 * number + 2)
-            del header["coordinates"]["time"]
+            header["coordinates"]["time"] = {"values": [n**2 for n in range(2 * number + 2)]}
             growing.publish(header, mark)
             if number == 0:
                 early = Container.open(path)
@@ -606,7 +603,7 @@ def test_an_interrupt_while_the_hidden_file_is_made_leaves_none(tmp_path, monkey
 
 
 @pytest.mark.parametrize("most", [1, 200])
-def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypatch, most) -> None:
+def test_a_table_beyond_a_member_is_cut_into_several(tmp_path, samples, monkeypatch, most) -> None:
     parts, header = table_parts(), samples.compact_header()
 
     def written(name: str, parts: TableParts) -> Path:
@@ -616,13 +613,13 @@ def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypat
         return tmp_path / name
 
     whole = written("whole.fhz", parts)
-    monkeypatch.setattr(sharding, "MAX_MEMBER", most)
+    monkeypatch.setattr(coding, "MAX_MEMBER", most)
     known = replace(parts, sizes=np.array([len(stream) for stream in parts.streams]))
     paths = [written(f"{number}.fhz", each) for number, each in enumerate((parts, known))]
     assert paths[0].read_bytes() == paths[1].read_bytes()
     with Container.open(whole) as container, Container.open(paths[0]) as cut:
         table, other = container.arrays["tables/level_1"], cut.arrays["tables/level_1"]
-        assert prod(other.shard_shape) < prod(table.shard_shape)
+        assert prod(other.together) < prod(table.together)
         np.testing.assert_array_equal(table.read(), other.read())
         for index in np.ndindex(table.grid):
             assert table.place(index)[1] == other.place(index)[1] == len(other.coded(index))

@@ -441,14 +441,16 @@ def test_a_large_part_is_decoded_whole() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "what"), [(16, "hidden layers"), (20, "hidden layers"), (2, "looks at other neigh")]
+    ("at_byte", "value", "what"),
+    [(0, 0, "hidden layers"), (0, 4, "hidden layers"), (1, 0, "widths"), (-1, 32, "weights")],
 )
-def test_a_head_of_other_hidden_layers_is_damage_in_a_tile(first: int, what: str) -> None:
+def test_a_head_that_is_wrong_is_damage_in_a_tile(at_byte: int, value: int, what: str) -> None:
     settings = with_head()
     assert settings.head is not None
     data = encode_tile(wave(WHOLE), settings, Coding(own_settings=True)).data
-    at = data.index(settings.head.to_bytes())
-    changed = resealed(data[:at] + bytes([first]) + data[at + 1 :])
+    packed = settings.head.to_bytes()
+    at = data.index(packed) + at_byte % len(packed)
+    changed = resealed(data[:at] + bytes([value]) + data[at + 1 :])
     with pytest.raises(DamagedFileError, match=f"head: it.* {what}"):
         decode_tile(changed, WHOLE, "float32", settings)
 

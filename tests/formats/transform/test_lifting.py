@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import json
 from contextlib import suppress
 from dataclasses import asdict
 from itertools import product
-from math import log2
 from typing import Any
 
 import numpy as np
@@ -22,14 +21,7 @@ from specs import MIXES, SHAPES, TYPES, axis_of, mixes_and_depths, noise, spec_o
 from tiles import HIGH, LOW, random_head, random_tile
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.head import (
-    INPUTS,
-    MAX_WEIGHT,
-    Layer,
-    NeighbourHead,
-    best_spread,
-    decode_weights,
-)
+from fhash_formats.transform.head import INPUTS, Layer, NeighbourHead
 from fhash_formats.transform.spec import KINDS as TRANSFORMS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 
@@ -357,20 +349,23 @@ def test_other_tiles_are_refused(tile: npt.NDArray[Any]) -> None:
 
 
 @pytest.mark.parametrize("hidden", [(12, 8), (1,), (24, 12), (64, 64, 64)])
-def test_bytes_there_and_back(hidden: tuple[int, ...]) -> None:
+def test_bytes_and_json_there_and_back(hidden: tuple[int, ...]) -> None:
     head = random_head(hidden)
-    assert head.to_bytes()[0] == 16 + len(hidden)
-    again = NeighbourHead.from_bytes(head.to_bytes())
-    assert (again.hidden, again.sigma, again.low, again.high) == (
-        head.hidden,
-        head.sigma,
-        head.low,
-        head.high,
-    )
-    for first, second in zip(head.layers, again.layers, strict=True):
-        np.testing.assert_array_equal(first.weights, second.weights)
-        np.testing.assert_array_equal(first.biases, second.biases)
-        assert (first.weight_scale, first.bias_scale) == (second.weight_scale, second.bias_scale)
+    assert head.to_bytes()[0] == len(hidden)
+    told = json.loads(json.dumps(head.to_json()))
+    assert len(told["weights"]) == sum(layer.weights.size for layer in head.layers)
+    for again in (NeighbourHead.from_bytes(head.to_bytes()), NeighbourHead.from_json(told)):
+        assert (again.hidden, again.sigma, again.low, again.high) == (
+            head.hidden,
+            head.sigma,
+            head.low,
+            head.high,
+        )
+        for first, second in zip(head.layers, again.layers, strict=True):
+            np.testing.assert_array_equal(first.weights, second.weights)
+            np.testing.assert_array_equal(first.biases, second.biases)
+            scales = second.weight_scale, second.bias_scale
+            assert (first.weight_scale, first.bias_scale) == scales
 
 
 def test_the_default_head_is_small() -> None:
@@ -394,24 +389,18 @@ def test_damaged_bytes_are_refused_or_are_another_sound_head(head: NeighbourHead
 @pytest.mark.parametrize(
     "start",
     [
-        b"\x10",
-        b"\x14\x04\x04\x04\x04",
-        b"\x92\x04\x04",
-        b"\x12\x04",
-        b"\x12\x04\x41",
-        b"\x12\x00\x04",
+        b"\x00",
+        b"\x04\x04\x04\x04\x04",
+        b"\x82\x04\x04",
+        b"\x02\x04",
+        b"\x02\x04\x41",
+        b"\x02\x00\x04",
     ],
 )
 def test_other_hidden_layers_are_refused(start: bytes) -> None:
     rest = random_head((4, 4)).to_bytes()[3:]
-    with pytest.raises(DamagedFileError, match=r"hidden layers|widths"):
+    with pytest.raises(DamagedFileError, match=r"hidden layers|widths|requires a buffer"):
         NeighbourHead.from_bytes(start + rest if len(start) > 2 else start)
-
-
-def test_a_head_that_looked_at_other_neighbours_is_refused() -> None:
-    data = random_head((4, 4)).to_bytes()
-    with pytest.raises(DamagedFileError, match="other neighbours"):
-        NeighbourHead.from_bytes(bytes([data[0] - 16]) + data[1:])
 
 
 @pytest.mark.parametrize(
@@ -470,29 +459,3 @@ def test_bad_layers_are_refused(change: dict[str, Any]) -> None:
         NeighbourHead(
             layers=(Layer(**fields), *head.layers[1:]), sigma=head.sigma, low=LOW, high=HIGH
         )
-
-
-def weights_of(spread: float, count: int = 300) -> list[int]:
-    drawn = np.random.default_rng(4).normal(0, spread, count)
-    return [int(weight) for weight in np.clip(np.rint(drawn), -MAX_WEIGHT, MAX_WEIGHT)]
-
-
-@pytest.mark.parametrize("spread", [0.0, 0.4, 1.0, 3.0, 9.0, 31.0, 100.0])
-@pytest.mark.parametrize("count", [0, 1, 7, 336])
-def test_the_best_spread_is_the_first_of_the_fewest_bits(spread: float, count: int) -> None:
-    weights = weights_of(spread, count)
-
-    def frequency(spread: int, weight: int) -> int:
-        return 1 + (spread**4 << 16) // (spread**2 + weight**2) ** 2
-
-    def bits(spread: int) -> float:
-        total = sum(frequency(spread, weight) for weight in range(-MAX_WEIGHT, MAX_WEIGHT + 1))
-        counts = sorted(Counter(weights).items())
-        return sum(count * log2(total / frequency(spread, weight)) for weight, count in counts)
-
-    assert best_spread(weights) == min(range(1, 256), key=bits)
-
-
-def test_a_spread_of_0_is_refused() -> None:
-    with pytest.raises(ValueError, match="spread"):
-        decode_weights(1, 1, 0)

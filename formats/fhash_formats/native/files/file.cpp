@@ -70,17 +70,10 @@ int32_t read_stream(void* user, uint64_t offset, uint64_t length, void* bytes) {
 bool describe(const Variable& variable, int axis, std::string& text, fhash_error& error) {
     const Json name = yyjson_obj_get(variable.coordinates[axis], "name");
     const Json kept = yyjson_obj_get(variable.coordinates[axis], "attributes");
-    yyjson_mut_doc* const made = yyjson_mut_doc_new(nullptr);
-    yyjson_mut_val* const root = yyjson_mut_obj(made);
-    yyjson_mut_doc_set_root(made, root);
-    yyjson_mut_obj_add_str(made, root, "name", name ? yyjson_get_str(name) : AXES[axis]);
-    yyjson_mut_obj_add_val(made, root, "attributes",
-                           kept ? yyjson_val_mut_copy(made, kept) : yyjson_mut_obj(made));
-    char* const written = yyjson_mut_write(made, 0, nullptr);
-    yyjson_mut_doc_free(made);
-    if (!written) return fail(error, FHASH_ERROR_MEMORY, "no memory for attributes");
-    text = written;
-    std::free(written);
+    std::string shown = "\"" + std::string(AXES[axis]) + "\"", attributes = "{}";
+    if ((name && !json_text(name, shown)) || (kept && !json_text(kept, attributes)))
+        return fail(error, FHASH_ERROR_MEMORY, "no memory for attributes");
+    text = "{\"name\":" + shown + ",\"attributes\":" + attributes + "}";
     return true;
 }
 
