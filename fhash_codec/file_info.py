@@ -110,7 +110,7 @@ class FileInfo(TypedDict):
         dict[str, Any], "the model, see FORMAT.md, The model; `between` is always there"
     ]
     config: Annotated[dict[str, Any], "every setting that the file was made with"]
-    mlp: Annotated[dict[str, Any] | None, "the MLP behind the table, if there is one there"]
+    mlp: NotRequired[Annotated[dict[str, Any] | None, "MLP of the default model; null for none"]]
     training: Annotated[dict[str, Any], "seconds, epochs, device and more"]
     history: Annotated[list[HistoryPoint], "course of the training"]
     quality: Annotated[FileQuality, "figures of the quality"]

@@ -206,6 +206,23 @@ def test_headers_and_positions_are_those_of_python(name: str) -> None:
                 assert described["attributes"] == dict(coordinate.attributes)
 
 
+def test_positions_that_are_no_numbers_are_those_of_python(tmp_path: Path) -> None:
+    path = tmp_path / "a.fhz"
+    path.write_bytes((GOLDEN / "compact-cubic.fhz").read_bytes())
+
+    def change(root):
+        header = root["attributes"]["fhash"]["variables"][0]
+        values = [0.5, "NaN", "Infinity", "-Infinity", *range(header["domain"]["shape"][0])]
+        header["coordinates"] = {"time": {"values": values[:-4]}, "x": {"ulps": [3], "step": 0.1}}
+        return root
+
+    edit(path, "zarr.json", change)
+    with Opened(path) as file, fhash_codec.open(path) as volume:
+        for axis, coordinate in enumerate(volume.coords.values()):
+            positions, _ = file.coordinate(0, axis, volume.shape[axis])
+            assert positions.tobytes() == coordinate.values.tobytes()
+
+
 SPACE = (16, 32, 32)
 
 

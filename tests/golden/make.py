@@ -1,10 +1,13 @@
-"""Writes the golden containers of the present form of the format: `python tests/golden/make.py`.
+"""Writes golden containers, the conformance files of the format: `python tests/golden/make.py`.
 
-Until a first release the format may change, and the goldens are made again. Tests only read them.
+What is there is frozen: every later 3.x reads it with the same bits (frozen.json has the digests).
+Only what is missing is written. Tests only read them.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +30,7 @@ from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 HERE = Path(__file__).parent
+FROZEN = HERE / "frozen.json"
 
 GOLDENS = {
     "paper-plain": EncodeConfig(
@@ -413,6 +417,19 @@ def main() -> None:
                 arrays[f"{start}whole"] = volume[...]
                 arrays[f"{start}between"] = np.stack([volume.read(t) for t in (0.5, last)])
         np.savez_compressed(HERE / f"{name}.npz", **arrays)
+        freeze(name)
+
+
+def freeze(name: str) -> None:
+    """Note the digests of a new golden and of its values."""
+    frozen = json.loads(FROZEN.read_text()) if FROZEN.exists() else {}
+    frozen[name] = {kind: digest(name, kind) for kind in ("fhz", "npz")}
+    FROZEN.write_text(json.dumps(frozen, indent=1, sort_keys=True) + "\n")
+
+
+def digest(name: str, kind: str) -> str:
+    """SHA-256 of a golden ("fhz") or of its values ("npz")."""
+    return hashlib.sha256((HERE / f"{name}.{kind}").read_bytes()).hexdigest()
 
 
 if __name__ == "__main__":

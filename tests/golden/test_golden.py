@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import warnings
 from math import prod
 from pathlib import Path
@@ -227,9 +229,15 @@ def test_the_source_of_a_golden_comes_back() -> None:
     assert (metadata.stored, metadata.file, metadata.digest) == ("int16", "golden.nc", "0123")
 
 
-def test_no_golden_is_left_untested() -> None:
+def test_no_golden_is_left_untested_and_none_has_changed() -> None:
     names = [*NAMES, *SEVERAL, *APPENDED]
     assert sorted(path.stem for path in HERE.glob("*.fhz")) == sorted(names)
+    for name, digests in json.loads((HERE / "frozen.json").read_text()).items():
+        for kind, digest in digests.items():
+            content = (HERE / f"{name}.{kind}").read_bytes()
+            assert hashlib.sha256(content).hexdigest() == digest, f"{name}.{kind} is frozen"
+        names.remove(name)
+    assert not names, "make.py freezes what it writes"
 
 
 @pytest.mark.parametrize("name", NAMES)

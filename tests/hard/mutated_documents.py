@@ -114,7 +114,7 @@ def _domain(chance: random.Random, parts: Parts) -> Parts:
     header = chance.choice(file.headers)
     shape = header["domain"]["shape"]
     for axis in chance.sample(range(4), chance.choice((1, 2, 4))):
-        shape[axis] = max(shape[axis], chance.choice((100, 2**10, 2**20, 2**40)))
+        shape[axis] = max(shape[axis], chance.choice((100, 2**10, 2**20, 2**26, 2**40)))
     header["coordinates"] = {name: _rule(chance) for name in AXES}
     return file.packed()
 
@@ -126,9 +126,9 @@ def _rule(chance: random.Random, old: Any = None) -> dict[str, Any]:
         key: chance.choice(numbers) for key in ("start", "step") if chance.random() < 0.5
     }
     if chance.random() < 0.4:
-        rule["dtype"] = chance.choice(("float32", "float32", "float64", "float16"))
+        rule["dtype"] = chance.choice((*["float32", "float64"] * 4, "float16"))
     if chance.random() < 0.3:
-        ulps = (0, 1, -1, 2**52 - 1, 1 - 2**52, 2**53)
+        ulps = (0, 1, -1, 5, -9, 2**52 - 1, 1 - 2**52, 2**53)
         rule["ulps"] = chance.choices(ulps, k=chance.choice((1, 2)))
     return rule
 

@@ -85,7 +85,7 @@ def _tiles(chance: random.Random, parts: Parts) -> Parts:
         for member in tiles.members:
             streams = [stream] * len(list(tiles.metadata.chunks_of(member)))
             new |= tiles.packed(member, streams)
-    kept = without(file.packed(), f"{file.table}/c/", f"{file.table}/t/", "missing/")
+    kept = without(file.packed(), f"{file.table}/c/", f"{file.table}/t/", "missing/", "occupancy/")
     return [*new.items(), *kept]
 
 
@@ -97,7 +97,7 @@ def _shapes(
     chunk = [1, 1, 1, 1]
     for axis in chance.sample(range(4), 4):
         chunk[axis] = 1 << chance.randrange(21)
-        while prod(chunk) > room:
+        while prod(chunk) > min(room, 1 << 27):
             chunk[axis] //= 2
     counts = [chance.choice((1, 1, 1, 2)) for _ in range(4)]
     shape = [

@@ -240,7 +240,8 @@ def _bytes(chance: random.Random, parts: Parts) -> Parts:
 def _index(chance: random.Random, parts: Parts) -> Parts:
     """Change the index of tiles: sums that do not fill the member, bytes of tiles that are none,
     another type, shape or grid, missing and further chunks."""
-    file = Documents(parts)
+    file = Documents(_together(chance, parts) if chance.random() < 0.5 else parts)
+    parts = file.parts
     names = [name for name, document in file.arrays.items() if is_coded(document)]
     names = [name for name in names if file.members(name)]
     if not names:
@@ -250,15 +251,17 @@ def _index(chance: random.Random, parts: Parts) -> Parts:
     values, turn = file.values(member), chance.randrange(10)
     grid = document["chunk_grid"]["configuration"]
     if turn < 5:
+        sizes = values.astype(np.int64)
         for _ in range(chance.choice((1, 1, 2))):
             a, b = chance.randrange(values.size), chance.randrange(values.size)
-            moved = chance.choice((1, int(values[a]), int(values[a]) // 2))
             if chance.random() < 0.5:  # from one tile to another, so that the sum stays
-                values[a], values[b] = int(values[a]) - moved, int(values[b]) + moved
+                moved = chance.choice((1, sizes[a], sizes[a] // 2))
+                sizes[a] -= moved
+                sizes[b] += moved
             else:
-                others = (0, 1, 4, 5, values.sum(), values[a] + 1, values[b], 2**31, 2**32 - 1)
-                values[a] = chance.choice(others)
-        return replaced(parts, {member: stored(values)})
+                others = (0, 1, 4, 5, sizes.sum(), sizes[a] + 1, sizes[b], 2**31, 2**32 - 1)
+                sizes[a] = chance.choice(others)
+        return replaced(parts, {member: stored(sizes.astype(np.uint32))})
     if turn == 5:  # another type
         kind = document["data_type"] = chance.choice(list(DTYPES))
         return file.packed({member: stored(values.astype(kind))})
@@ -286,18 +289,20 @@ def _index(chance: random.Random, parts: Parts) -> Parts:
 
 NUMBERED = (
     *("t/00", "t/01", "t/", "t", "t/-1", "t/0/0", "t/0x0", "t/ 0", "T/0", "t/1.0", "c/0", "t/c/0"),
-    *(f"t/{number}" for number in (1, 2, 7, 2**31, 2**32, 2**63, 2**63 + 1, 2**64, 10**19 - 1)),
+    *(f"t/{number}" for number in (1, 2, 7, 2**31, 2**32, 2**63, 2**64, 10**19 - 1)),
 )
 """Names of members of tiles, most of them of none."""
 
 
 def _members(chance: random.Random, parts: Parts) -> Parts:
     """Rename, repeat, drop, cut or lengthen a member of tiles, or put one to another array."""
-    file = Documents(parts)
-    name, turn = _coded(chance, file), chance.randrange(6)
+    file = Documents(_together(chance, parts) if chance.random() < 0.5 else parts)
+    parts, name, turn = file.parts, _coded(chance, file), chance.randrange(6)
     at = chance.choice([at for at, item in enumerate(parts) if item[0].startswith(f"{name}/t/")])
     member, data = parts[at]
-    other = f"{name}/{chance.choice(NUMBERED)}"
+    number = int(member.rpartition("/")[2])
+    same = (f"t/0{number}", *(f"t/{number + 2**bits}" for bits in (31, 32, 63, 63, 64)))
+    other = f"{name}/{chance.choice(NUMBERED if chance.random() < 0.7 else same)}"
     if turn == 0:
         changed = [(other, data)]
     elif turn == 1:

@@ -463,7 +463,7 @@ def _training(info: VolumeInfo) -> str:
     training, model = info["training"], info["model"]
     told = "steps" in training
     if model["profile"] == "compact" and (not told or training["steps"] == 0):
-        return "not told" if info["mlp"] and not told else "none"
+        return "not told" if info.get("mlp") and not told else "none"
     steps = f"{training['steps']:,} steps, " if told else ""
     seconds = training["seconds"]
     took = "" if seconds is None else f" in {number(seconds, 's', digits=3)} of wall time,"
@@ -473,7 +473,7 @@ def _training(info: VolumeInfo) -> str:
         if rate is None
         else f"; it diverged, and came to its end at a learning rate of {rate:.3g}"
     )
-    unused = model["profile"] == "compact" and info["mlp"] is None
+    unused = model["profile"] == "compact" and info.get("mlp") is None
     saved = "; it saved too little, and was left out" if unused else ""
     if "saved" in training:
         saved = f"; it saves about {training['saved']:.0%} of the bytes of the values"

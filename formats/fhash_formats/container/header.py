@@ -372,7 +372,6 @@ DEFAULTS: dict[str, Any] = {
     "dilation": 1,
     "coreset_fraction": 1.0,
     "coordinates": {},
-    "mlp": None,
     "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
     "history": {},
 }
@@ -399,6 +398,8 @@ def validate_header(header: Mapping[str, Any]) -> None:
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
     plain = PLAIN_FEATURE in header["required_features"]
     profile = _check_model(top.record("model"), shape[0], box, dtype, plain=plain)
+    if profile == COMPACT:
+        top.get(MLP)
     if (profile == COMPACT and not plain) or header["model"]["tables"] == CODED:
         needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
         top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)

@@ -160,7 +160,7 @@ class Split(TypedDict):
 
     field: Annotated[int, "tables, corrections, and which vertices have values"]
     beside: Annotated[int, "arrays that the source has beside the values"]
-    model: Annotated[int, "layers, and documents of coded tables: head, bases and steps"]
+    model: Annotated[int, "layers in arrays, and documents of tables of tiles: bases and steps"]
     index: Annotated[int, "header, directory, names, and all else"]
 
 
@@ -250,7 +250,7 @@ class Container:
         attributes = json.loads(root.text)["attributes"]
         headers = read_headers(attributes.pop("fhash"))
         self.attributes = MappingProxyType(attributes)
-        mlps = {path_of(header, TABLE): header[MLP] for header in headers.values()}
+        mlps = {path_of(header, TABLE): header.get(MLP) for header in headers.values()}
         stored = {
             node.number: StoredArray(
                 self.path,

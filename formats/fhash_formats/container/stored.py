@@ -491,6 +491,7 @@ class StoredArray:
         """
         if self._metadata.indexed:
             self._file.check(self.number)
+            self._file.stored(self.number, [0] * len(self.shape))  # an index before many futures
         for _ in in_threads(self._decode_and_drop, product(*map(range, self.grid))):
             done()
 

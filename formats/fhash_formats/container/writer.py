@@ -172,7 +172,7 @@ class _Variable:
             array that lies there.
         mark: of the file before its first array; None for the only variable.
         written: paths of its arrays by name.
-        mlp: of its tiles, for the header.
+        mlp: of its tiles, None or JSON values, by the header's key; empty for none yet.
     """
 
     name: str | None
@@ -181,7 +181,7 @@ class _Variable:
     shares: dict[str, Any] = field(default_factory=dict)
     mark: Mark | None = None
     written: dict[str, str] = field(default_factory=dict)
-    mlp: Mapping[str, Any] | None = None
+    mlp: dict[str, Any] = field(default_factory=dict)
 
 
 CODED = ("shape", "data_type", "chunk_grid", "codecs", "attributes")
@@ -413,7 +413,7 @@ class ContainerWriter:
     def _describe(self, name: str, metadata: ArrayMetadata) -> None:
         """Take the metadata of an array, whose document is written with those of all."""
         if name == TABLE and metadata.together is not None:
-            codec, self._current().mlp = without_mlp(metadata.codecs[0])
+            codec, self._current().mlp[MLP] = without_mlp(metadata.codecs[0])
             metadata = replace(metadata, codecs=[codec])
         values = metadata.to_dict()
         dumps(values, f"the metadata of array {name}")
@@ -556,8 +556,7 @@ class ContainerWriter:
             entry["name"] = variable.name
         if self.one_of_several:
             entry[GROUP_KEY] = f"v{variable.number}"
-        if variable.mlp is not None:
-            entry[MLP] = variable.mlp
+        entry |= variable.mlp
         if variable.shares:
             entry[SHARES] = variable.shares
         if variable.number:

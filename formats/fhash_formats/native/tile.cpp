@@ -295,11 +295,15 @@ bool decode_as(const Job& job, O* values, uint8_t* occupied, fhash_error& error)
     const int kind = job.stream.kind;
     if (kind == EXACT) return decode_exact(job, values, occupied, error);
     if (kind == DIFFERENCES) {
+#if defined(FHASH_SMALL)  // no page reads arrays beside the values
+        return fail(error, FHASH_ERROR_UNSUPPORTED, "a tile of differences");
+#else
         if (!job.lod) return decode_differences(job.stream.body, job.shape, values, error);
         std::vector<O> all((size_t)job.size());
         if (!decode_differences(job.stream.body, job.shape, all.data(), error)) return false;
         thin(all.data(), job.shape, job.lod, values);
         return true;
+#endif
     }
     if (!job.settings && !(kind == LABELS && !job.stream.masked))
         return fail(error, FHASH_ERROR_DAMAGED, "a coded tile has no settings");

@@ -197,7 +197,7 @@ struct Indices {
         for (size_t i = 0; i <= count; i++) {
             std::memcpy(starts.data() + 8 * i, &position, 8);
             const uint64_t next = i < count ? from_little(sizes.data() + 4 * i, 4) : 0;
-            if (next > size - position || (next && !present(number, i)))
+            if (next > size - position || (i < count && (next != 0) != present(number, i)))
                 return fail(error, FHASH_ERROR_DAMAGED, "the index of its tiles has other bytes");
             position += next;
         }

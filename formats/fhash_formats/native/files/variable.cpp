@@ -236,7 +236,10 @@ bool read_mlp(Variable& variable, fhash_error& error) {
     Record mlp;
     int64_t widths[3], biases[193];
     double constants[3];
-    if (!variable.compact || !variable.header.find_value("mlp")) return true;
+    if (!variable.compact) return true;
+    if (!variable.header.find_value("mlp"))
+        return variable.header.need(variable.header.find("mlp") != nullptr, "mlp",
+                                    "null or an object", error);
     if (!variable.header.record("mlp", mlp, error)) return false;
     const size_t count = yyjson_arr_size(mlp.find("widths"));
     if (!mlp.need(count >= 1 && count <= 3, "widths", "1 to 3 widths", error) ||
