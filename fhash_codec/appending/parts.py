@@ -23,7 +23,7 @@ from fhash_codec.compact.tiles import Blocks, CodedTiles
 from fhash_codec.comparison import Report, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Extent, packed_masks, resolve_features
-from fhash_codec.features.occupancy import read_bits, unpack, write_blocks
+from fhash_codec.features.occupancy import BLOCK, read_bits, unpack, write_blocks
 from fhash_codec.features.scan import Scan, scan_steps
 from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import (
@@ -40,7 +40,7 @@ from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import SOURCE, Container, ContainerWriter
 from fhash_formats.container.growing import TableParts
-from fhash_formats.container.header import EVERYTHING, MISSING_ARRAY, NOT_STORED, TABLE
+from fhash_formats.container.header import BITS_ARRAY, EVERYTHING, MISSING_ARRAY, NOT_STORED, TABLE
 from fhash_formats.container.record import Record
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import DamagedFileError, InputError
@@ -429,6 +429,9 @@ class _Piece:
             raise DamagedFileError(f"{self.path}: array {TABLE} has no settings of all tiles")
         if not isinstance(header["model"].get("gains"), list):
             raise DamagedFileError(f"{self.path}: header key model.gains is missing or no list")
+        bits = container.arrays.get(BITS_ARRAY)
+        if table.masked and (bits is None or BLOCK in bits.attributes):
+            raise DamagedFileError(f"{self.path}: array {BITS_ARRAY} is missing or not of vertices")
         self.table, self.settings = table, table.settings
         self.errors = errors.read()
         if not _are_sums(self.errors, prod(header["domain"]["shape"][1:])):

@@ -55,8 +55,10 @@ MOST_EXCESS = 6.0
 """dB above the promise that an MLP is credited with at most, since no such step was tried."""
 MLP_BYTES = 110
 """Approximate bytes of an MLP in the deflated header beside its numbers."""
-WEIGHT_BYTES, BIAS_BYTES = 0.6875, 2.5
-"""Approximate bytes of a number there."""
+WEIGHT_BYTES = 0.6875
+"""Approximate bytes of a weight there."""
+BIAS_BYTES = 2.5
+"""The same of a bias."""
 TRAINING_NS = 0.12
 """Nanoseconds of a product in training."""
 JOINT = 1.2

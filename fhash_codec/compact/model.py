@@ -360,7 +360,9 @@ class CompactModel:
         self._table = self._arrays[TABLE]
         self._plain: PlainArray | None = None
         if PLAIN_FEATURE in container.header["required_features"]:
-            self._plain = PlainArray(container.header["model"], container.header.get(MLP), self._arrays)
+            self._plain = PlainArray(
+                container.header["model"], container.header.get(MLP), self._arrays
+            )
         self._array = self._plain or self._table
         self.chunks = self._array.chunk_shape
         self._cubic = rule_between(container.header)["rule"] == CUBIC

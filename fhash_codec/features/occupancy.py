@@ -171,7 +171,7 @@ def blocks_of(box: Sequence[int], block: int) -> Shape:
 
 
 def any_of_blocks(mask: npt.NDArray[np.bool_], block: int) -> npt.NDArray[np.bool_]:
-    """Which blocks of a mask (z, y, x) have a vertex; a block at an end may be shorter."""
+    """Mask of the blocks that have a vertex of a mask (z, y, x); those at an end may be shorter."""
     for axis, length in enumerate(mask.shape):
         mask = np.logical_or.reduceat(mask, range(0, length, block), axis=axis)
     return mask

@@ -159,7 +159,7 @@ POSITIONS: tuple[Any, ...] = (
     *({"ulps": [0] * (1 << 20)}, {"values": [10**30, 2**64, 2**63 - 1]}, {"values": [[0]]}),
     *({"name": "x"}, {"name": ""}, {"name": 0}, {"attributes": []}, {"attributes": {"units": 0}}),
 )
-"""What may stand in place of an axis' object: numbers of variables, and objects."""
+"""Values in place of an axis' object: numbers of variables, and objects."""
 
 
 def _pair(chance: random.Random, old: Any) -> list[float]:

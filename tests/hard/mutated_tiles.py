@@ -644,7 +644,10 @@ def _occupancy(chance: random.Random, parts: Parts) -> Parts:
         raise NothingFitsError
     turn = chance.randrange(7)
     if turn == 0:  # another block, or none
-        old, block = file.arrays[name].get("attributes", {}), (1, 2, 3, 64, 2**40, 0, -1, 1.0, None)
+        old, block = (
+            file.arrays[name].get("attributes", {}),
+            (1, 2, 8, 16, 64, 2**40, 3, 0, -1, 1.0),
+        )
         changed = {**old, "block": chance.choice(block)} if chance.random() < 0.7 else {}
         file.arrays[name]["attributes"] = changed
         return file.packed()

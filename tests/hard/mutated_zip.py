@@ -174,7 +174,7 @@ def _deflated(chance: random.Random, parts: Parts) -> bytes:
     given = []
     for name, data in parts:
         packed = name.endswith(DOCUMENT) or chance.random() < 0.1
-        full = max(0, len(data) + chance.choice((0, 0, 0, 0, 1, -1))) if packed else None
+        full = max(0, len(data) + chance.choice((*[0] * 20, 1, -1))) if packed else None
         given.append((name, deflated(data) if packed else data, full, zlib.crc32(data)))
     return pack_members(given)
 

@@ -131,7 +131,7 @@ Index = tuple[int, ...]
 
 
 def tiles_together(grid: Sequence[int], sizes: npt.NDArray[np.int64] | None = None) -> Index:
-    """How many tiles along each axis a writer lays into one member, of an array of such a `grid`.
+    """Numbers of tiles along each axis that a writer lays into one member, of an array of a `grid`.
 
     One member holds the whole array up to SINGLE_MEMBER_TILES. A larger array gets a member for
     each layer of tiles along the first axis. Members beyond the limits of the format are halved,

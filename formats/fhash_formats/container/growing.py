@@ -177,14 +177,15 @@ class GrowingContainer(ContainerWriter):
 
     def _layers(self, array: GrowingArray, steps: int) -> ArrayMetadata:
         """The metadata of an array of so many steps, a layer of tiles in each member."""
-        return self._metadata(
-            array.name,
-            (steps, *array.frame),
-            array.dtype,
-            array.tile,
+        metadata = ArrayMetadata(
+            shape=(steps, *array.frame),
+            dtype=array.dtype,
+            chunk_shape=array.tile,
             codecs=array.codecs,
             together=(1, *array.layer_grid),
         )
+        self._check(array.name, metadata)
+        return metadata
 
     def publish(self, header: Mapping[str, Any], mark: Mark) -> int:
         """Write the documents and the directory, and let the file take its name.

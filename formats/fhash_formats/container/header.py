@@ -77,10 +77,10 @@ def shared_coordinates(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, A
     """Headers in which axes have the objects of the variables whose numbers stood there."""
     found = []
     for entry in entries:
-        coordinates = {
-            axis: entries[told]["coordinates"][axis] if isinstance(told, int) else told
-            for axis, told in entry.get("coordinates", {}).items()
-        }
+        coordinates = dict(entry.get("coordinates", {}))
+        for axis in POSITIONS:  # those that libfhash has looked at
+            if type(told := coordinates.get(axis)) is int:
+                coordinates[axis] = entries[told]["coordinates"][axis]
         found.append({**entry, "coordinates": coordinates})
     return found
 

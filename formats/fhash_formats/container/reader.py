@@ -206,7 +206,8 @@ class Container:
             "fhash" of the root.
         attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
-        arrays: StoredArray by name, in the order of the file; of several variables by path.
+        arrays: StoredArray by name, in the order of the file; by "/" and the path those outside of
+            the variable's group. Of several variables, by path.
         variables: of a file of several, by name in the order of its list; each is a container as
             if it were alone in the file. None in a file of one variable.
         variable: name of the variable where the container is one of those; else None.
@@ -272,7 +273,11 @@ class Container:
                 check_source(header, arrays)
             variables.append((name, header, arrays))
         if len(variables) == 1:
-            self._name, self.header, self.arrays = variables[0]
+            self._name, self.header, own = variables[0]
+            names = {array.number: name for name, array in own.items()}
+            self.arrays = MappingProxyType(
+                {names.get(n, f"/{array.name}"): array for n, array in stored.items()}
+            )
             return
         self.arrays = MappingProxyType({array.name: array for array in stored.values()})
         self.header = json.loads(root.text)["attributes"]["fhash"]

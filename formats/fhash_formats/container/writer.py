@@ -310,16 +310,18 @@ class ContainerWriter:
             InputError: for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
-        metadata = self._metadata(
-            name,
-            shape,
-            number_type,
-            chunk_shape,
-            codecs=plain_codecs(number_type) if codecs is None else codecs,
-            together=together,
-            dimension_names=dimension_names,
-            attributes=attributes,
+        coding = plain_codecs(number_type) if codecs is None else codecs
+        tiled = coding[0]["name"] == TRANSFORM
+        metadata = ArrayMetadata(
+            shape=tuple(int(n) for n in shape),
+            dtype=number_type,
+            chunk_shape=tuple(int(n) for n in chunk_shape),
+            codecs=tuple(coding),
+            together=tuple(together or (1,) * len(shape)) if tiled else None,
+            dimension_names=None if dimension_names is None else tuple(dimension_names),
+            attributes=dict(attributes or {}),
         )
+        self._check(name, metadata)
         remaining = iter(chunks)
         for index in product(*(range(n) for n in metadata.members)):
             self._add_member(name, metadata, index, member_chunks(name, metadata, index, remaining))
@@ -372,26 +374,15 @@ class ContainerWriter:
             codecs=codecs,
         )
 
-    def _metadata(
-        self,
-        name: str,
-        shape: Sequence[int],
-        dtype: np.dtype[Any],
-        chunk_shape: Sequence[int],
-        *,
-        codecs: Sequence[Codec],
-        together: Sequence[int] | None = None,
-        dimension_names: Sequence[str | None] | None = None,
-        attributes: Mapping[str, Any] | None = None,
-    ) -> ArrayMetadata:
-        """The metadata of an array that can be stored. Raises InputError for another."""
-        lengths, sides = [int(n) for n in shape], [int(n) for n in chunk_shape]
-        fits = len(lengths) == len(sides) and 1 <= len(lengths) <= MAX_DIMENSIONS
-        if not fits or min(*lengths, *sides) < 1 or dtype.name not in DTYPES:
+    def _check(self, name: str, metadata: ArrayMetadata) -> None:
+        """Raise InputError for an array that cannot be stored, or is there already."""
+        shape, chunk, dtype = metadata.shape, metadata.chunk_shape, metadata.dtype
+        fits = len(shape) == len(chunk) and 1 <= len(shape) <= MAX_DIMENSIONS
+        if not fits or min(*shape, *chunk) < 1 or dtype.name not in DTYPES:
             raise InputError(
-                f"array {name} cannot be stored: {dtype} of shape {lengths} in chunks of {sides}"
+                f"array {name} cannot be stored: {dtype} of shape {list(shape)} in chunks of"
+                f" {list(chunk)}"
             )
-        tiles = codecs[0]["name"] == TRANSFORM
         path = self._path(name)
         if not NAME.fullmatch(path) or len(path) > MAX_NAME // 2:
             raise InputError(
@@ -400,15 +391,6 @@ class ContainerWriter:
             )
         if path in self._arrays:
             raise InputError(f"array {path} is there already")
-        return ArrayMetadata(
-            shape=tuple(lengths),
-            dtype=dtype,
-            chunk_shape=tuple(sides),
-            codecs=tuple(codecs),
-            together=tuple(together or (1,) * len(lengths)) if tiles else None,
-            dimension_names=None if dimension_names is None else tuple(dimension_names),
-            attributes=dict(attributes or {}),
-        )
 
     def _describe(self, name: str, metadata: ArrayMetadata) -> None:
         """Take the metadata of an array, whose document is written with those of all."""

@@ -102,6 +102,7 @@ def make_compact_header() -> dict[str, Any]:
     """A header of the profile compact, whose only array need be the table."""
     header = make_header()
     header["required_features"] = ["transform"]
+    header["mlp"] = None
     header["model"] = {
         "profile": "compact",
         "levels": [[4, 3, 4, 6]],

@@ -64,6 +64,7 @@ def growing_header(steps: int, frame: tuple[int, int, int] = FRAME) -> dict[str,
         "features": ["all"],
         "dilation": 0,
         "coreset_fraction": 1.0,
+        "mlp": None,
         "model": {
             "profile": "compact",
             "levels": [[steps, *frame]],

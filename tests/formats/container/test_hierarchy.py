@@ -202,7 +202,8 @@ ROOTS = {
         {"auxiliary/a": [2, "auxiliary/b"]},
         "auxiliary/a is missing",
     ),
-    "no MLP": (HEADS, ..., "variable 'u': .*lack that of the header"),
+    "no MLP": (HEADS, ..., "variable 'u': header key mlp is missing"),
+    "an identity": (HEADS, None, "variable 'u': .*lack that of the header"),
     "an MLP that the settings do not have": (
         "attributes.fhash.variables.2.mlp",
         HEAD.to_json(),

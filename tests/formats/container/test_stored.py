@@ -371,7 +371,7 @@ def test_every_region_reads_equal(tmp_path, samples, case) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_any_library_of_zarr_finds_every_tile(tmp_path, samples, case) -> None:
-    """As FORMAT.md says: the index gives the sizes, the attribute what tiles are."""
+    """It is as FORMAT.md says: the index gives the sizes, the attribute what tiles are."""
     shape, tile, together = CASES[case]
     values = random_values(shape)
     path = write_tiled(tmp_path / "a.fhz", samples, values, tile, together)

@@ -14,7 +14,7 @@ from fhash_formats.container.array import TRANSFORM, ArrayMetadata
 
 NAME = "extra/values"
 CODECS = [{"name": TRANSFORM, "configuration": {}}]
-"""Of tiles without settings: differences of neighbours, without loss."""
+"""Codecs of tiles without settings: differences of neighbours, without loss."""
 
 
 def chunk_of(values: np.ndarray, index: Sequence[int], chunk_shape: Sequence[int]) -> np.ndarray:

@@ -100,7 +100,8 @@ fhash_tile tile_of(const Array& array) {
 
 // Whether a part of a tile may be had sooner than all of it: the head need not see the rest.
 bool is_parted(const Array& array) {
-    const bool headed = array.tiles() && !array.settings.empty() && (uint8_t(array.settings[0]) & 32);
+    const bool own = array.tiles() && !array.settings.empty();
+    const bool headed = own && (uint8_t(array.settings[0]) & 32);
     return headed && !array.masked() && array.usual && array.axes == 4;
 }
 

@@ -475,6 +475,7 @@ bool read_variables(Hierarchy& hierarchy, std::vector<Variable>& found, fhash_er
     if (!top.need(count > 0, "variables", "a list of at least one object", error)) return false;
     found.resize(count);
     std::vector<std::map<std::string, const Array*>> own(count);
+    std::map<const Array*, size_t> owners;  // of tables
     std::set<std::string> names;
     yyjson_arr_iter iter = yyjson_arr_iter_with(list);
     for (size_t i = 0; i < count; i++) {
@@ -505,6 +506,14 @@ bool read_variables(Hierarchy& hierarchy, std::vector<Variable>& found, fhash_er
         const bool apart = settings.empty() && found[i].mlp.empty();  // each tile has its own
         if (!apart && !insert_head(settings, found[i].mlp, error))
             return in_variable(found, i, error);
+        owners[&table->second] = i;
+    }
+    for (size_t i = 0; i < count; i++) {
+        const auto owner = owners.find(found[i].find(TABLE));
+        if (owner != owners.end() && found[owner->second].mlp != found[i].mlp) {
+            fail(error, FHASH_ERROR_DAMAGED, "its mlp is not that of the table that it shares");
+            return in_variable(found, i, error);
+        }
     }
     return true;
 }

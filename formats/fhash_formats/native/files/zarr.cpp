@@ -232,10 +232,11 @@ bool split_chunk(const std::string& name, std::string& path, std::vector<int64_t
             std::reverse(index.begin(), index.end());
             return true;
         }
-        if (part.empty() || part.size() > 19 || (part.size() > 1 && part[0] == '0') ||
+        // 18 digits are below 2^63.
+        if (part.empty() || part.size() > 18 || (part.size() > 1 && part[0] == '0') ||
             part.find_first_not_of("0123456789") != std::string::npos || index.size() > MAX_AXES)
             return false;
-        index.push_back(int64_t(std::strtoull(part.c_str(), nullptr, 10) & uint64_t(INT64_MAX)));
+        index.push_back(int64_t(std::strtoull(part.c_str(), nullptr, 10)));
         stop = slash;
     }
 }
