@@ -269,7 +269,7 @@ def _missing(values: npt.NDArray[Any], fills: Sequence[Any]) -> npt.NDArray[np.b
 
 
 def _together(tile: Index, grid: Index, itemsize: int) -> Index:
-    """Numbers of tiles along each axis that lie in a member, such that they come in the order of steps.
+    """Numbers of tiles along each axis that lie in a member, so that steps keep their order.
 
     A member has several layers along t only where it has all of each.
     """

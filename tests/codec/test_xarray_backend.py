@@ -6,7 +6,6 @@ import io
 import pickle
 import tomllib
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -17,7 +16,6 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-import xarray
 import xarray as xr
 import zarr
 from cf_files import KINDS, Kind, smooth
@@ -33,31 +31,6 @@ from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
 
 SHAPE = (5, 4, 12, 10)
-
-
-def values() -> np.ndarray[Any, Any]:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE), indexing="ij")
-    return (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
-
-
-def series(
-    data: np.ndarray[Any, Any] | None = None,
-    name: str = "rain rate",
-    times: Sequence[float] = (0, 1, 2.5, 4, 9),
-) -> ArraySeries:
-    coords = {
-        "t": Coordinate(name="time", values=np.array(times)),
-        "z": Coordinate(name="height", values=np.array([1.0, 2.0, 4.0, 8.0])),
-        "x": Coordinate(name="lon", values=np.linspace(0, 90, SHAPE[3])),
-    }
-    return ArraySeries(values() if data is None else data, name=name, units="mm h-1", coords=coords)
-
-
-def shown(path: Path) -> xarray.Dataset:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        store = zarr.storage.ZipStore(path, mode="r")
-        return xarray.open_zarr(store, consolidated=False, chunks=None).load()
 
 
 VALUES = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5) + 1

@@ -199,6 +199,15 @@ def test_a_hostile_part_is_refused(tmp_path, change, message) -> None:
     assert os.listdir(tmp_path) == ["part1.fhz"]
 
 
+def test_a_part_of_masked_tiles_without_occupancy_is_refused(tmp_path) -> None:
+    parts = parts_of(values(), tmp_path, settings(features=("interval:0:9",)), 1)
+    with Container.open(parts[0]) as container:
+        assert container.arrays["tables/level_1"].masked
+    rewritten(parts[0], lambda header, errors: None)
+    with pytest.raises(DamagedFileError, match="array occupancy is missing"):
+        merge(parts, tmp_path / "run.fhz")
+
+
 @pytest.mark.parametrize("kind", ["rotated", "calendar"])
 def test_what_belongs_to_the_variable_in_its_source_is_that_of_the_whole(tmp_path, kind) -> None:
     pytest.importorskip("h5netcdf")

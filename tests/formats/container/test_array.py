@@ -308,6 +308,11 @@ MEMBERS = {
         lambda p: p.update({"tables/level_1/t/0": b"x"}),
         "member tables/level_1/t/0 belongs to no array",
     ),
+    # As a number of 64 bits without a sign this is 0 beyond 2^63.
+    "tiles of a giant number": (
+        lambda p: p.update({f"{NAME}/t/{1 << 63}": p.pop(f"{NAME}/t/0")}),
+        "has 0 chunks",
+    ),
     "tiles outside": (
         lambda p: p.update({f"{NAME}/t/1": p.pop(f"{NAME}/t/0")}),
         f"member {NAME}/t/1 belongs to no array",

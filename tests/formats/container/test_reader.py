@@ -675,3 +675,11 @@ def test_the_bytes_of_a_file_are_split_without_a_rest(tmp_path, samples) -> None
         )
         assert each["paper"]["model"] == weights
         assert file.variables["group/v"].split()["beside"] == 0, "the array is that of u"
+
+
+@pytest.mark.parametrize("odd", [7, True, 1 << 63, {"values": [1]}])
+def test_coordinates_of_axes_that_nobody_knows_are_ignored(tmp_path, samples, odd) -> None:
+    header = samples.header()
+    header["coordinates"]["w"] = odd
+    samples.write(tmp_path / "a.fhz", header, samples.arrays(header))
+    Container.open(tmp_path / "a.fhz").close()
