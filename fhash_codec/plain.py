@@ -28,6 +28,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.header import (
     BITS_ARRAY,
+    CORESET_ARRAY,
     LAYERS,
     MISSING_ARRAY,
     PLAIN_FEATURE,
@@ -126,13 +127,15 @@ class _Export:
             if SPARSE in model or f"tables/level_{table.level}" not in self._arrays
         ]
         levels = (f"tables/level_{table.level}/" for table in coded)
-        rewritten = (*levels, f"{LAYERS}/")
+        masks = (f"{CORESET_ARRAY}/", f"{BITS_ARRAY}/") if CORESET_ARRAY in self._arrays else ()
+        rewritten = (*levels, f"{LAYERS}/", *masks)
         copied = {
             name: array
             for name, array in self._arrays.items()
             if not f"{name}/".startswith(rewritten)
         }
-        self._total = sum(prod(array.grid) for array in copied.values())
+        keys = len(self._volume.key_times.key_frames) if masks else 0
+        self._total = sum(prod(array.grid) for array in copied.values()) + keys
         self._total += sum(map(_chunk_count, coded))
         self._write_coordinates()
         for name, array in copied.items():
@@ -143,6 +146,8 @@ class _Export:
                     self._writer.add_whole(f"mlp/{name}_{number}", values)
         for table in coded:
             self._write_table(table)
+        if keys:
+            self._write_occupancy(keys)
         tables, mlp = self._volume.tables, self._volume.mlp
         changed = {
             "tables": coded[0].dtype.name if coded else model["tables"],

@@ -16,7 +16,7 @@ from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import BLOCK, pack, packed_bytes
 from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
-from fhash_formats.container.header import BITS_ARRAY, LAYERS, TABLE
+from fhash_formats.container.header import BITS_ARRAY, CORESET_ARRAY, LAYERS, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.values import Mask
@@ -172,7 +172,7 @@ class Card:
         if BITS_ARRAY in arrays:
             stored = self._stored(BITS_ARRAY, "")
             block = arrays[BITS_ARRAY].attributes.get(BLOCK, 1)
-            if self.profile == "compact" and block > 1:
+            if CORESET_ARRAY in arrays or block > 1:
                 stored["coding"] = f"blocks of {block} vertices; {self._in_tiles}"
             return {"shape": list(arrays[BITS_ARRAY].shape[1:]), **stored, "apart": apart}
         masked = self.container.arrays[TABLE].masked
@@ -181,7 +181,8 @@ class Card:
 
     @property
     def _in_tiles(self) -> str:
-        return f"of every vertex in the tiles of {self._table_path}"
+        path = CORESET_ARRAY if CORESET_ARRAY in self.container.arrays else self._table_path
+        return f"of every vertex in the tiles of {path}"
 
     @property
     def _table_path(self) -> str:

@@ -265,7 +265,9 @@ class _Job:
             streams=coded.streams,
         )
         parts.write(writer)
-        if parts.settings.mask is not None:  # of vertices: the blocks of the whole are not known
+        if (
+            parts.settings.mask is not None and EVERYTHING not in plan.features
+        ):  # of vertices: the blocks of the whole are not known
             write_blocks(writer, partial(self._mask, blocks), parts.shape, 0)
         own = deepcopy(dict(plan.header))
         own["required_features"] = ["transform"]
@@ -430,7 +432,8 @@ class _Piece:
         if not isinstance(header["model"].get("gains"), list):
             raise DamagedFileError(f"{self.path}: header key model.gains is missing or no list")
         bits = container.arrays.get(BITS_ARRAY)
-        if table.masked and (bits is None or BLOCK in bits.attributes):
+        occupied = table.masked and EVERYTHING not in header["features"]
+        if occupied and (bits is None or BLOCK in bits.attributes):
             raise DamagedFileError(f"{self.path}: array {BITS_ARRAY} is missing or not of vertices")
         self.table, self.settings = table, table.settings
         self.errors = errors.read()
@@ -613,7 +616,7 @@ class _Whole:
         )
         progress("merging", 0, 1, "")
         table.write(writer)
-        if table.settings.mask is not None:
+        if table.settings.mask is not None and EVERYTHING not in header["features"]:
             self._write_blocks(writer, table)
         progress("merging", 1, 1, "")
         header["variable"] = self._variable()

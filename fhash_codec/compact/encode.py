@@ -633,13 +633,14 @@ def encode_compact(
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
     gaps = selection.extent.fraction < 1
     source = describe_source(series, selection.scanned.value_range, config, gaps=gaps)
+    everything = any(isinstance(feature, Everything) for feature in selection.features)
     with stage("writing", "coordinates and masks of missing values, tiles, header"):
         described = write_series(
             writer,
             series,
             selection.scanned,
             selection.extent.key_frames,
-            everything=any(isinstance(feature, Everything) for feature in selection.features),
+            everything=everything,
         )
     mark = writer.mark()
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
@@ -652,7 +653,7 @@ def encode_compact(
         parts = table.parts
         with stage("writing", "tiles"):
             parts.write(writer)
-            if parts.settings.mask is not None:
+            if parts.settings.mask is not None and not everything:
                 extent, size = selection.extent, sum(map(len, parts.streams))
                 write_blocks(writer, extent.mask, parts.shape, size)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container import Container, ContainerWriter
-from fhash_formats.container.header import BITS_ARRAY
+from fhash_formats.container.header import BITS_ARRAY, CORESET_ARRAY
 
 BLOCK = "block"
 """Attribute of the occupancy: vertices of a block along each axis; 1 without it."""
@@ -199,8 +199,13 @@ def read_occupancy(
     Arguments are those of `read_bits`.
     """
     z, y, x = container.header["model"]["levels"][0][1:]
-    grids = read_bits(container, first, end, features)
-    return np.stack([unpack(bits, (z, y, x)) for bits in grids])
+    if CORESET_ARRAY not in container.arrays:
+        grids = read_bits(container, first, end, features)
+        return np.stack([unpack(bits, (z, y, x)) for bits in grids])
+    space = (slice(0, z), slice(0, y), slice(0, x))
+    numbers = container.arrays[CORESET_ARRAY].read((slice(first, end), *space))
+    chosen = range(len(container.header["features"])) if features is None else features
+    return np.asarray(numbers & np.uint8(sum(1 << number for number in set(chosen))) != 0)
 
 
 def _shape(mask: npt.NDArray[np.bool_]) -> Shape:

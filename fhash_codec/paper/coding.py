@@ -26,13 +26,14 @@ from fhash_codec.features.selection import FeatureSelection
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.network import Architecture, Layer, Network
-from fhash_codec.paper.storage import Bricks, component_name, write_occupancy
+from fhash_codec.paper.storage import Bricks, component_name
 from fhash_codec.paper.tables import (
     Samples,
     TrainedTable,
     quantised_layers,
     trained_tables,
     write_layers,
+    write_mask,
 )
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
@@ -242,7 +243,7 @@ class ModelCoding:
                 mixing = [float(str(each)) for each in component.mixing]
                 table.parts.write(writer, component_name(level, number), {"mixing": mixing})
         write_layers(writer, self.layers, self.layer_settings)
-        write_occupancy(writer, self.coreset)
+        write_mask(writer, self.coreset)
 
     def loss(self, network: Network) -> float:
         """Return the dB of PSNR over the samples that the coding of a written model has cost."""

@@ -9,13 +9,14 @@ from typing import Protocol
 import numpy as np
 
 from fhash_codec.boxes import Box
+from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.model import input_slopes, sample_points
 from fhash_codec.paper.network import Architecture, Layer, Network
-from fhash_codec.paper.storage import Bricks, needed_by
+from fhash_codec.paper.storage import Bricks, needed_by, write_occupancy
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.array import transform_codecs
-from fhash_formats.container.header import LAYERS
+from fhash_formats.container.header import CORESET_ARRAY, LAYERS, MASK_FEATURES
 from fhash_formats.support.values import Double, Longs, Mask, Single
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.tile import Coding, encode_tile
@@ -187,8 +188,7 @@ MIN_WEIGHTS = 512
 WEIGHT_STEPS = tuple(2.0**-power for power in range(2, 13))
 """Quantiser steps tried for the weights of a matrix, as shares of their root mean square."""
 MASK_VERTICES = 4 << 20
-"""Vertices of a chunk of the occupancy; a frame is read by decoding one chunk."""
-
+"""Vertices of a tile of masks; a frame is read by decoding one tile."""
 _PLAIN = TransformSpec.from_dict(dict.fromkeys("tzyx", "none"))
 
 
@@ -234,6 +234,52 @@ def write_layers(
         codecs = None if how is None else transform_codecs(how)
         writer.add_whole(f"mlp/weight_{number}", weight, codecs=codecs)
         writer.add_whole(f"mlp/bias_{number}", bias)
+
+
+def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
+    """Write the masks of a coreset as tiles of labels, and the bits of blocks of vertices.
+
+    A number has one bit for each feature. More than MASK_FEATURES are written as bits of vertices.
+    """
+    box, grids = coreset.box.shape, coreset.grids
+    keys = len(coreset.occupancy)
+    steps = max(1, min(keys, MASK_VERTICES // prod(box)))
+    if len(grids) > MASK_FEATURES:
+        write_occupancy(writer, coreset)
+        return
+
+    def numbers(key: int) -> occupancy.Bits:
+        result = np.zeros(box, np.uint8)
+        for bit, packed in enumerate(grids):
+            result |= occupancy.unpack(packed[key], box).view(np.uint8) << np.uint8(bit)
+        return result
+
+    writer.add_array(
+        CORESET_ARRAY,
+        shape=(keys, *box),
+        dtype=np.uint8,
+        chunk_shape=(steps, *box),
+        chunks=(
+            np.stack([numbers(key) for key in range(first, min(first + steps, keys))])
+            for first in range(0, keys, steps)
+        ),
+        codecs=transform_codecs(
+            TileSettings(
+                transform=_PLAIN,
+                step=1.0,
+                center=0.0,
+                low=0.0,
+                high=float((1 << len(grids)) - 1),
+                labels=True,
+            )
+        ),
+    )
+    occupancy.write_blocks(
+        writer,
+        lambda key: numbers(key) != 0,
+        (keys, *box),
+        writer.mark().position,  # all that the file has so far: tables, network and masks
+    )
 
 
 def _weight_settings(weight: Single, share: float) -> TileSettings | None:

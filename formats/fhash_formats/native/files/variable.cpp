@@ -307,7 +307,13 @@ bool check_arrays(const Variable& variable, fhash_error& error) {
     } else {
         const int64_t features = variable.compact ? 1 : variable.features;
         const std::vector<int64_t> bits = {features, level[0], occupancy_bytes(variable)};
-        if (!check_array(variable, "occupancy", bits, {FHASH_UINT8}, true, error) ||
+        const bool masked = !variable.compact && variable.find("coreset");
+        if (masked && (features > 8 || variable.model.find("sparse")))
+            return fail(error, FHASH_ERROR_DAMAGED, "array coreset is there in a file of sparse "
+                                                    "tables, or of more than 8 features");
+        if (!check_array(variable, "coreset", lengths, {FHASH_UINT8}, masked, error) ||
+            !(masked ? check_blocks(variable, error)
+                     : check_array(variable, "occupancy", bits, {FHASH_UINT8}, true, error)) ||
             !(variable.compact ? check_plain(variable, error) : check_network(variable, error)))
             return false;
     }

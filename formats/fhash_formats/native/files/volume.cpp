@@ -320,6 +320,13 @@ bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice
 
 bool add_occupancy(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                    Buffer& mask, fhash_error& error) {
+    if (const Array* const array = variable.find("coreset")) {
+        Frame frame;
+        if (!read_table(file, *array, key, lattice, frame, error)) return false;
+        const uint8_t all = uint8_t((1u << variable.features) - 1);
+        for (size_t i = 0; i < mask.size(); i++) mask[i] |= (frame.values[i] & all) != 0;
+        return true;
+    }
     const Array* const array = variable.find("occupancy");
     if (!array) return fail(error, FHASH_ERROR_DAMAGED, "array occupancy is missing");
     return add_bits(file, variable, *array, key, lattice, mask, error);
