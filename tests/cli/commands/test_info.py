@@ -33,7 +33,7 @@ def added(line: str) -> bool:
              "mlp/weight_1 to mlp/weight_2",
              "relu", "; occupancy, bytes,"],
         ),
-        ("paper-transform", ["fhash.transform", "; occupancy, bytes,"]),
+        ("paper-transform", ["fhash.transform", "in the tiles of coreset"]),
         ("paper-sparse", ["; 2 at each needed vertex, float16; tables/level_1 to tables/"]),
         ("compact-psnr", ["tables/level_1, fhash.transform,", "none: the values"]),
         ("compact-mask", ["in the tiles of tables/level_1"]),

@@ -22,6 +22,7 @@ from fhash_codec.features.bricks import Coreset, build_coreset
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
+from fhash_codec.paper import tables as small_parts
 from fhash_codec.paper.coding import COMMON, MAX_LOSS, WRITINGS, Component, ModelCoding
 from fhash_codec.paper.encode import select
 from fhash_codec.paper.fit import TrainedModel
@@ -136,15 +137,23 @@ def test_layers_that_no_step_keeps_stay_as_they_are() -> None:
     assert quantised[0][0] is original[0][0]
 
 
-def test_the_bits_are_the_occupancy(tmp_path, waves, coded_config) -> None:
+@pytest.mark.parametrize("vertices", [1, 5000, 1 << 22])
+def test_the_masks_are_the_coreset(tmp_path, waves, coded_config, monkeypatch, vertices) -> None:
+    monkeypatch.setattr(small_parts, "MASK_VERTICES", vertices)
     config = replace(coded_config, epochs=1, features=("interval:50:150",), dilation=0)
     path = tmp_path / "a.fhz"
     fhash_codec.encode(waves(), path, config)
     coreset = select(ArraySeries(waves()), config, silent).coreset
     with Container.open(path) as container:
-        grids = container.arrays["occupancy"].read()[0]
-    for step, bits in zip(grids, coreset.occupancy, strict=True):
-        np.testing.assert_array_equal(step, bits)
+        masks, blocks = (container.arrays[name] for name in ("coreset", "occupancy"))
+        block, found = (
+            blocks.attributes["block"],
+            list(zip(masks.read(), blocks.read()[0], strict=True)),
+        )
+    for (mask, bits), packed in zip(found, coreset.occupancy, strict=True):
+        np.testing.assert_array_equal(mask != 0, occupancy.unpack(packed, coreset.box.shape))
+        coarse = occupancy.any_of_blocks(mask != 0, block)
+        np.testing.assert_array_equal(occupancy.unpack(bits, coarse.shape), coarse)
     with fhash_codec.open(path) as volume:
         both = volume.occupancy(0.5)
         np.testing.assert_array_equal(both, volume.occupancy(0) | volume.occupancy(1))
