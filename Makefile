@@ -12,7 +12,7 @@ QUICK := $(SPREAD) --assert=plain
 # Programs that tests start would else compile all that they import.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types units torch vtk clang docs notebooks hard every results device lib paraview compile-times lowest newest wheels \
+.PHONY: demo test types units torch vtk clang docs site heavy notebooks hard every results device lib paraview compile-times lowest newest wheels \
 	wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
@@ -37,10 +37,16 @@ torch vtk clang: %: .venv/.%
 
 # The documentation site: build/docs/index.html. Needs no network; a warning is an error. All that its pages show runs; its
 # reference imports modules that need torch.
-docs: .venv/.docs .venv/.torch .venv/.vtk
+docs: site
+	$(BIN)/python -m pytest $(SPREAD) -m docs
+
+site: .venv/.docs .venv/.torch .venv/.vtk
 	rm -rf build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
-	$(BIN)/python -m pytest $(SPREAD) -m docs
+
+# The tests of docs, torch and vtk in one run, which collects once.
+heavy: .venv/.docs .venv/.torch .venv/.vtk
+	$(BIN)/python -m pytest $(QUICK) -m '(docs or torch or vtk) and not every'
 
 # The notebooks of the documentation with their outputs.
 notebooks: .venv/.docs
