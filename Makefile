@@ -44,9 +44,9 @@ site: .venv/.docs .venv/.torch .venv/.vtk
 	rm -rf build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
-# The tests of docs, torch and vtk in one run, which collects once.
+# The tests of docs and vtk in one run, which collects once.
 heavy: .venv/.docs .venv/.torch .venv/.vtk
-	$(BIN)/python -m pytest $(QUICK) -m '(docs or torch or vtk) and not every'
+	$(BIN)/python -m pytest $(QUICK) -m '(docs or vtk) and not every'
 
 # The notebooks of the documentation with their outputs.
 notebooks: .venv/.docs
