@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -35,9 +35,9 @@ from fhash_formats.container.header import (
     SPARSE,
     STEPS,
 )
-from fhash_formats.container.hierarchy import SHOWN_ATTRIBUTES
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.errors import InputError
+from fhash_formats.series import AXES
 from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import chunk_region, slab_shape
 from fhash_formats.transform.head import NeighbourHead
@@ -47,6 +47,13 @@ __all__ = ["export_plain"]
 CHUNK_BYTES = 2 << 20
 """Bytes of a decoded chunk of a table that is not cut by tiles."""
 
+TAKEN = {
+    *(BITS_ARRAY, CORESET_ARRAY, MISSING_ARRAY, STEPS),
+    *("key_frames", "corrections", "tables", "mlp", "auxiliary", "whole", "step_errors"),
+}
+"""Names of arrays and groups in the root of a file of one variable."""
+SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
+"""Attributes of a variable that its array has for libraries that show it."""
 Index = tuple[int, ...]
 
 
@@ -110,7 +117,7 @@ class _Export:
         self._arrays = volume.container.arrays
         self._header = volume.container.header
         writer.begin()
-        self._names = [_node(each.name, axis) for axis, each in volume.coords.items()]
+        self._names = _nodes([each.name for each in volume.coords.values()])
         own = (len(volume.key_times.key_frames), *volume.box.shape)
         sizes = zip(self._names, own, volume.shape, strict=True)
         # A coordinate that has positions beside those of the table names no axis of it.
@@ -336,11 +343,17 @@ class _Export:
             self._writer.rewind(mark)
 
 
-def _node(name: str, axis: str) -> str:
-    """The name of the array of a coordinate: its own where that is one and no part's."""
-    taken = {BITS_ARRAY, MISSING_ARRAY, STEPS, "key_frames", "corrections", "tables", "mlp"}
-    allowed = re.fullmatch(r"[A-Za-z0-9-][A-Za-z0-9_-]{0,80}", name) and name not in taken
-    return name if allowed else f"axis_{axis}"
+def _nodes(names: Sequence[str]) -> list[str]:
+    """Names of the arrays of the coordinates of t, z, y and x: their own where that is allowed.
+
+    It is not for what no array may be called, what FORMAT.md calls another, and one that is there.
+    """
+    found: list[str] = []
+    for axis, name in zip(AXES, names, strict=True):
+        good = re.fullmatch(r"[A-Za-z0-9-][A-Za-z0-9_-]{0,80}", name) and name not in TAKEN
+        free = name if good and name not in found else f"axis_{axis}"
+        found.append(free if free not in found else f"axis_{axis}_")
+    return found
 
 
 def _chunk_shape(table: Table) -> Index:

@@ -23,7 +23,7 @@ from fhash_codec.compact.tiles import Blocks, CodedTiles
 from fhash_codec.comparison import Report, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Extent, packed_masks, resolve_features
-from fhash_codec.features.occupancy import BLOCK, read_bits, unpack, write_blocks
+from fhash_codec.features.occupancy import BLOCK, has_blocks, read_bits, unpack, write_blocks
 from fhash_codec.features.scan import Scan, scan_steps
 from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import (
@@ -265,9 +265,8 @@ class _Job:
             streams=coded.streams,
         )
         parts.write(writer)
-        if (
-            parts.settings.mask is not None and EVERYTHING not in plan.features
-        ):  # of vertices: the blocks of the whole are not known
+        if has_blocks(parts.settings.mask is not None, plan.features):
+            # of vertices: those of the whole are not known
             write_blocks(writer, partial(self._mask, blocks), parts.shape, 0)
         own = deepcopy(dict(plan.header))
         own["required_features"] = ["transform"]
@@ -432,8 +431,8 @@ class _Piece:
         if not isinstance(header["model"].get("gains"), list):
             raise DamagedFileError(f"{self.path}: header key model.gains is missing or no list")
         bits = container.arrays.get(BITS_ARRAY)
-        occupied = table.masked and EVERYTHING not in header["features"]
-        if occupied and (bits is None or BLOCK in bits.attributes):
+        exact = bits is not None and BLOCK not in bits.attributes
+        if has_blocks(table.masked, header["features"]) and not exact:
             raise DamagedFileError(f"{self.path}: array {BITS_ARRAY} is missing or not of vertices")
         self.table, self.settings = table, table.settings
         self.errors = errors.read()
@@ -616,7 +615,7 @@ class _Whole:
         )
         progress("merging", 0, 1, "")
         table.write(writer)
-        if table.settings.mask is not None and EVERYTHING not in header["features"]:
+        if has_blocks(table.settings.mask is not None, header["features"]):
             self._write_blocks(writer, table)
         progress("merging", 1, 1, "")
         header["variable"] = self._variable()

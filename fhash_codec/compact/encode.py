@@ -53,7 +53,7 @@ from fhash_codec.compact.tiles import (
 from fhash_codec.compact.transform import refit, usual_transform
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Everything
-from fhash_codec.features.occupancy import write_blocks
+from fhash_codec.features.occupancy import has_blocks, write_blocks
 from fhash_codec.features.selection import FeatureSelection, select_features
 from fhash_codec.header import GAIN, HEAD_POINTS, brief_history, describe_source, write_series
 from fhash_codec.measure.errors import bulk_of_ranks, find_bulk
@@ -633,14 +633,13 @@ def encode_compact(
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
     gaps = selection.extent.fraction < 1
     source = describe_source(series, selection.scanned.value_range, config, gaps=gaps)
-    everything = any(isinstance(feature, Everything) for feature in selection.features)
     with stage("writing", "coordinates and masks of missing values, tiles, header"):
         described = write_series(
             writer,
             series,
             selection.scanned,
             selection.extent.key_frames,
-            everything=everything,
+            everything=any(isinstance(feature, Everything) for feature in selection.features),
         )
     mark = writer.mark()
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
@@ -653,7 +652,7 @@ def encode_compact(
         parts = table.parts
         with stage("writing", "tiles"):
             parts.write(writer)
-            if parts.settings.mask is not None and not everything:
+            if has_blocks(parts.settings.mask is not None, map(str, selection.features)):
                 extent, size = selection.extent, sum(map(len, parts.streams))
                 write_blocks(writer, extent.mask, parts.shape, size)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None

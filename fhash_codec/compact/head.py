@@ -54,11 +54,12 @@ GAIN_OF_MLP = 1.6
 MOST_EXCESS = 6.0
 """dB above the promise that an MLP is credited with at most, since no such step was tried."""
 MLP_BYTES = 110
-"""Approximate bytes of an MLP in the deflated header beside its numbers."""
+"""Bytes of an MLP in the deflated header without its numbers: 465 in all of 440 weights and 21
+biases on the vortex."""
 WEIGHT_BYTES = 0.6875
-"""Approximate bytes of a weight there."""
+"""Bytes of a weight there, a letter of a Huffman code: 5 to 6 bits."""
 BIAS_BYTES = 2.5
-"""The same of a bias."""
+"""The same of a bias, up to four characters and a comma."""
 TRAINING_NS = 0.12
 """Nanoseconds of a product in training."""
 JOINT = 1.2

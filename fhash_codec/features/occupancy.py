@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container import Container, ContainerWriter
-from fhash_formats.container.header import BITS_ARRAY, CORESET_ARRAY
+from fhash_formats.container.header import BITS_ARRAY, CORESET_ARRAY, EVERYTHING
 
 BLOCK = "block"
 """Attribute of the occupancy: vertices of a block along each axis; 1 without it."""
 BLOCK_SHARE = 100
-"""The bits of blocks take at most this part of the bytes of the tiles."""
+"""The bits of blocks take at most this part of the bytes of the tiles: one percent."""
 CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of an array of bits. A member for each row would cost 130 bytes."""
 
@@ -121,6 +121,14 @@ def write_bits(
         chunks=chunks(),
         attributes=attributes,
     )
+
+
+def has_blocks(masked: bool, features: Iterable[str]) -> bool:
+    """Whether a file of the profile compact has the bits of blocks: where features were asked for.
+
+    masked: whether its tiles have masks. features: as the header has them.
+    """
+    return masked and EVERYTHING not in features
 
 
 def write_blocks(

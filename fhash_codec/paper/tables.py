@@ -276,7 +276,7 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
     )
     occupancy.write_blocks(
         writer,
-        lambda key: numbers(key) != 0,
+        lambda key: occupancy.unpack(coreset.occupancy[key], box),
         (keys, *box),
         writer.mark().position,  # all that the file has so far: tables, network and masks
     )

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import product
 from math import prod
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -165,17 +164,13 @@ class Tiles:
         for a chunk that the store lacks, unless its fill value is taken.
         """
         with thread_pool() as pool:
-            looks = map_ahead(pool, self._look, self._order(), AHEAD * usable_threads())
-            for number, (index, look) in enumerate(zip(self._order(), looks, strict=True), start=1):
+            order, again = self.metadata.in_order(), self.metadata.in_order()
+            looks = map_ahead(pool, self._look, order, AHEAD * usable_threads())
+            for number, (index, look) in enumerate(zip(again, looks, strict=True), start=1):
                 self.facts.add(look, self.metadata.region(index))
                 told(number)
                 yield look.stream
         self.facts.flush()
-
-    def _order(self) -> Iterator[Index]:
-        """Yield the tiles in the order of the file."""
-        for member in product(*map(range, self.metadata.members)):
-            yield from self.metadata.chunks_of(member)
 
     def check_against_store(self) -> None:
         """Compare the first and the last tile with what zarr decodes from the store.

@@ -7,7 +7,7 @@ import os
 import struct
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import product
@@ -24,7 +24,7 @@ from fhash_codec.header import figure_attributes, history_line, read_missing, so
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume, holds
 from fhash_formats.container import StoredArray
-from fhash_formats.container.array import with_crc32c
+from fhash_formats.container.array import ArrayMetadata, with_crc32c
 from fhash_formats.container.header import COMPACT, MISSING_ARRAY, PLAIN_FEATURE, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.readers.stored_parts import ABSENT
@@ -54,8 +54,8 @@ class ChunkTable:
         outline: of the array, and of all beside it.
         dtype: of the values.
         chunk: lengths of a chunk.
-        grid: number of chunks along each dimension.
-        together: chunks of a shard along each dimension.
+        layout: chunks in the order of the dimensions, as they lie in the file's members, which
+            become shards.
         codec: that decodes the chunks.
         fill: the number that stands for a missing value; None where there is none, or NaN.
 
@@ -84,15 +84,20 @@ class ChunkTable:
         if any(lengths[axis] > 1 for axis in made_up):
             raise InputError(_refusal(volume, "tiles that are longer than an axis it made up"))
         self.chunk = self.outline.ordered(self._table.chunk_shape)
-        self.grid = self.outline.ordered(self._table.grid)
-        self.together = self.outline.ordered(self._table.together or (1, 1, 1, 1))
+        self.layout = ArrayMetadata(
+            shape=self.outline.shape,
+            dtype=self.dtype,
+            chunk_shape=self.chunk,
+            codecs=(),
+            together=self.outline.ordered(self._table.together or (1, 1, 1, 1)),
+        )
 
     @property
     def shard(self) -> Index | None:
         """Lengths of a shard; None where chunks are files of their own."""
-        if prod(self.together) == 1:
+        if not self.layout.indexed:
             return None
-        return tuple(n * k for n, k in zip(self.chunk, self.together, strict=True))
+        return tuple(n * k for n, k in zip(self.chunk, self.layout.together or (), strict=True))
 
     @property
     def codec(self) -> TransformCodec:
@@ -238,7 +243,7 @@ def unpack(
         "path": str(output),
         "bytes": size,
         "seconds": time.perf_counter() - begun,
-        "variables": {table.outline.name: {"tiles": prod(table.grid)} for table in tables},
+        "variables": {table.outline.name: {"tiles": prod(table.layout.grid)} for table in tables},
     }
 
 
@@ -334,14 +339,14 @@ def _add_table(root: Any, table: ChunkTable) -> None:
 def _write_chunks(folder: Path, table: ChunkTable, progress: Progress) -> None:
     """Write the chunks of a table, each in a file of its own, or those of a shard in one."""
     place, name = folder / table.outline.name, table.outline.name
-    total, done = prod(table.grid), 0
+    total, done = prod(table.layout.grid), 0
     progress("unpacking", 0, total, name)
-    for outer, indices in _files(table):
+    for outer in product(*map(range, table.layout.members)):
         path = place.joinpath("c", *map(str, outer))
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as file:
             streams: dict[Index, int] = {}
-            for index in indices:
+            for index in table.layout.chunks_of(outer):
                 streams[index] = file.write(table.stream(index))
                 done += 1
                 progress("unpacking", done, total, name)
@@ -354,19 +359,12 @@ def _shard_index(table: ChunkTable, outer: Index, sizes: dict[Index, int]) -> by
 
     sizes: bytes of the chunks that are there, in the order in which they lie in the shard.
     """
-    entries = np.full((*table.together, 2), ABSENT, dtype="<u8")
+    together = table.layout.together or ()
+    entries = np.full((*together, 2), ABSENT, dtype="<u8")
     offset = 0
     for index, size in sizes.items():
-        corner = (i * k for i, k in zip(outer, table.together, strict=True))
+        corner = (i * k for i, k in zip(outer, together, strict=True))
         place = tuple(i - first for i, first in zip(index, corner, strict=True))
         entries[place] = offset, size
         offset += size
     return with_crc32c(entries.tobytes())
-
-
-def _files(table: ChunkTable) -> Iterator[tuple[Index, Iterator[Index]]]:
-    """Yield the index of each file of an array, and those of the chunks in it, in their order."""
-    along = list(zip(table.grid, table.together, strict=True))
-    for outer in product(*(range(-(-n // k)) for n, k in along)):
-        spans = zip(outer, along, strict=True)
-        yield outer, product(*(range(i * k, min((i + 1) * k, n)) for i, (n, k) in spans))

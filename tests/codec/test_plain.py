@@ -263,3 +263,18 @@ def test_a_header_that_does_not_fit_is_damage(tmp_path: Path) -> None:
             return root
 
         refused(message, "zarr.json", change)
+
+
+def test_coordinates_of_any_name_are_exported(tmp_path: Path) -> None:
+    """Names that arrays cannot have, that others have, and the same one twice."""
+    names = dict(zip("tzyx", ("auxiliary", "a b", "depth", "depth"), strict=True))
+    coords = {
+        axis: Coordinate(name=name, values=np.arange(n) * 2.5)
+        for (axis, name), n in zip(names.items(), (3, 4, 5, 6), strict=True)
+    }
+    series = ArraySeries(moving("float32")[:, :4, :5, :6], name="a", coords=coords)
+    fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(max_error=0.1, effort=1))
+    export_plain(tmp_path / "a.fhz", tmp_path / "plain.fhz")
+    with fhash_codec.open(tmp_path / "plain.fhz") as volume:
+        assert {axis: volume.coords[axis].name for axis in "tzyx"} == names
+        assert {"axis_t", "axis_z", "depth", "axis_x"} <= volume.container.arrays.keys()

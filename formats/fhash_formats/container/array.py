@@ -81,22 +81,22 @@ def with_mlp(codec: Codec, mlp: Mapping[str, Any]) -> Codec:
     from fhash_formats.transform.head import NeighbourHead
     from fhash_formats.transform.tile_format import TileSettings
 
-    told = codec["configuration"]
-    settings = TileSettings.from_text(told["settings"], NeighbourHead.from_json(mlp))
-    return {**codec, "configuration": {**told, "settings": settings.to_text()}}
+    configuration = codec["configuration"]
+    settings = TileSettings.from_text(configuration["settings"], NeighbourHead.from_json(mlp))
+    return {**codec, "configuration": {**configuration, "settings": settings.to_text()}}
 
 
 def without_mlp(codec: Codec) -> tuple[Codec, Mapping[str, Any] | None]:
     """The codec of tiles without its MLP, and that as a header has it."""
     from fhash_formats.transform.tile_format import TileSettings
 
-    told = codec["configuration"]
-    if "settings" not in told:
+    configuration = codec["configuration"]
+    if "settings" not in configuration:
         return codec, None
-    settings = TileSettings.from_text(told["settings"])
+    settings = TileSettings.from_text(configuration["settings"])
     if settings.head is None:
         return codec, None
-    apart = {**told, "settings": settings.to_text(apart=True)}
+    apart = {**configuration, "settings": settings.to_text(apart=True)}
     return {**codec, "configuration": apart}, settings.head.to_json()
 
 
@@ -206,11 +206,6 @@ class ArrayMetadata:
         return str(self.codecs[0]["name"])
 
     @property
-    def chunk_bytes(self) -> int:
-        """Bytes of a decoded chunk."""
-        return prod(self.chunk_shape) * self.dtype.itemsize
-
-    @property
     def grid(self) -> tuple[int, ...]:
         """Number of chunks along each axis."""
         return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.chunk_shape, strict=True))
@@ -235,6 +230,11 @@ class ArrayMetadata:
                 for i, count, n in zip(member, together, self.grid, strict=True)
             )
         )
+
+    def in_order(self) -> Iterator[Index]:
+        """Yield the chunks in the order in which they lie in the file."""
+        for member in product(*map(range, self.members)):
+            yield from self.chunks_of(member)
 
     def member_name(self, member: Index) -> str:
         """Name of a member below that of its array: "c/0/0" of a chunk, "t/0" of tiles."""
@@ -296,12 +296,12 @@ class ArrayMetadata:
         tiles = attributes.pop(TILES, None)
         chunk = tuple(values["chunk_grid"]["configuration"]["chunk_shape"])
         if tiles is not None:
-            told = {key: tiles[key] for key in ("settings", "axes") if key in tiles}
+            configuration = {key: tiles[key] for key in ("settings", "axes") if key in tiles}
             return cls(
                 shape=tuple(tiles["shape"]),
                 dtype=DTYPES[tiles["data_type"]],
                 chunk_shape=tuple(tiles["tile"]),
-                codecs=[{"name": TRANSFORM, "configuration": told}],
+                codecs=[{"name": TRANSFORM, "configuration": configuration}],
                 together=chunk,
                 mlp=mlp,
                 attributes=attributes,

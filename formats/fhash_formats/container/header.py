@@ -18,13 +18,13 @@ from fhash_formats.support.values import DTYPES, Double
 MAX_LISTED = 1 << 20
 """Numbers of a list of positions, or of differences from a rule."""
 MAX_NEARLY = 1024
-"""Positions up to which rules are tried from which all of them differ a little."""
+"""Positions up to which rules are tried from which all differ a little; each try is a pass."""
 MAX_ULPS = 99
 """Units in the last place by which a position but the last may differ from a written rule."""
 ULPS_LIMIT = 2**52 - 1
 """Largest such difference that a reader takes."""
 MAX_RULED = 1 << 26
-"""Positions of a rule; the limit keeps a few bytes from asking for much memory."""
+"""Positions of a rule: 512 MiB. The limit keeps a few bytes from asking for more memory."""
 NOT_FINITE = ("NaN", "Infinity", "-Infinity")
 """Texts of positions that are no numbers in JSON."""
 TYPES = ("float64", "float32")
@@ -79,8 +79,8 @@ def shared_coordinates(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, A
     for entry in entries:
         coordinates = dict(entry.get("coordinates", {}))
         for axis in POSITIONS:  # those that libfhash has looked at
-            if type(told := coordinates.get(axis)) is int:
-                coordinates[axis] = entries[told]["coordinates"][axis]
+            if type(number := coordinates.get(axis)) is int:
+                coordinates[axis] = entries[number]["coordinates"][axis]
         found.append({**entry, "coordinates": coordinates})
     return found
 

@@ -15,8 +15,6 @@ GROUP_KEY = "group"
 """Key of the header of one of several variables: the group of its arrays, v and its number."""
 SHARES = "shares"
 """Key of a variable's header: arrays that lie with another variable."""
-SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
-"""Attributes of a variable that its array has for libraries that show it."""
 
 _OF_ROOT = ("format", "format_version", "required_features")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from math import prod
@@ -223,7 +223,7 @@ class Container:
     arrays: Mapping[str, StoredArray]
     variables: Mapping[str, VariableContainer] = MappingProxyType({})
     variable: str | None = None
-    _documents: Sequence[int]
+    _documents: int
 
     def __init__(self, path: Path | str, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
         """Read a container from an open source, which `close` closes; `open` is for files.
@@ -245,11 +245,12 @@ class Container:
         """Take the header and the arrays of the file."""
         file, self.digest = self._file, self._file.digest
         nodes = file.nodes()
-        self._documents = range(len(nodes))
+        self._documents = len(nodes)
         root = next(node for node in nodes if not node.path)
         self.header_bytes = root.document_bytes
         attributes = json.loads(root.text)["attributes"]
-        headers = read_headers(attributes.pop("fhash"))
+        of_file = attributes.pop("fhash")
+        headers = read_headers(of_file)
         self.attributes = MappingProxyType(attributes)
         mlps = {path_of(header, TABLE): header.get(MLP) for header in headers.values()}
         stored = {
@@ -280,7 +281,7 @@ class Container:
             )
             return
         self.arrays = MappingProxyType({array.name: array for array in stored.values()})
-        self.header = json.loads(root.text)["attributes"]["fhash"]
+        self.header = of_file
         self.variables = MappingProxyType(
             {
                 name: VariableContainer(self, number, header, arrays)
@@ -353,8 +354,8 @@ class Container:
         `progress(done, total)` counts metadata documents, as read already, and chunks. Raises
         DamagedFileError that names the member.
         """
-        total = len(self._documents) + sum(prod(array.grid) for array in self.arrays.values())
-        done = len(self._documents)
+        total = self._documents + sum(prod(array.grid) for array in self.arrays.values())
+        done = self._documents
 
         def count() -> None:
             nonlocal done
@@ -363,8 +364,6 @@ class Container:
                 progress(done, total)
 
         with damage_named(self.path, self._source):
-            for place in self._documents:
-                self._file.check_document(place)
             for array in self.arrays.values():
                 array.verify(count)
         return len(self.arrays)
@@ -463,7 +462,7 @@ class VariableContainer(Container):
             name for name, array in arrays.items() if name in shared or array.name.startswith(begin)
         ]
         self.size = sum(arrays[name].place_bytes for name in self._own)
-        self._documents = [arrays[name].place_of_document for name in self._own]
+        self._documents = len(self._own)
 
     def closing_file(self) -> VariableContainer:
         """Itself, from now on with a `close` that closes the file, and so all variables."""

@@ -45,7 +45,6 @@ class Node:
         stored_bytes: bytes of the data of its chunks.
         place_bytes: bytes of all of these, with their places in the ZIP.
         number: of the array; 0 for a group.
-        place: of the node in the order of the file, from 0.
     """
 
     path: str
@@ -54,10 +53,9 @@ class Node:
     stored_bytes: int
     place_bytes: int
     number: int
-    place: int
 
 
-def _node(found: Any, place: int) -> Node:
+def _node(found: Any) -> Node:
     return Node(
         path=_text(found.path),
         text=bytes(ffi.buffer(found.text, found.text_size)),
@@ -65,7 +63,6 @@ def _node(found: Any, place: int) -> Node:
         stored_bytes=found.stored,
         place_bytes=found.place,
         number=found.array,
-        place=place,
     )
 
 
@@ -196,7 +193,7 @@ class NativeFile:
         listed: list[Node] = []
         with self._using() as handle:
             while native.library().fhash_file_node(handle, len(listed), found):
-                listed.append(_node(found, len(listed)))
+                listed.append(_node(found))
         return listed
 
     def places(self, variable: int) -> dict[str, int]:
@@ -259,10 +256,6 @@ class NativeFile:
         ends = [end for along in bounds for end in along]
         self._asked("fhash_array_announce", number, ends)
 
-    def check_document(self, place: int) -> None:
-        """Check the zarr.json of a node, which need not have been read."""
-        self._asked("fhash_file_check", place)
-
     def check(self, number: int) -> None:
         """Check the members of an array by their checksums."""
         self._asked("fhash_array_check", number)
@@ -296,7 +289,6 @@ class StoredArray:
     Attributes:
         name: path in the hierarchy.
         number: of the array in the file.
-        place_of_document: of its metadata among those of the file, from 0.
         shape: length of each axis.
         dtype: number type.
         chunk_shape: shape of a full chunk.
@@ -319,7 +311,7 @@ class StoredArray:
     ) -> None:
         """Take an array of an open file. path: of the file, for messages."""
         self._path, self._source, self._file = path, source, file
-        self._metadata, self.place_of_document = metadata, node.place
+        self._metadata = metadata
         self.name, self.number = node.path, node.number
         self.nbytes_stored, self.place_bytes = node.stored_bytes, node.place_bytes
         self.document_bytes = node.document_bytes

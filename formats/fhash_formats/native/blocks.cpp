@@ -170,11 +170,9 @@ Table block_table(const AxisTransform* axes, const Shape& shape) {
 
 bool split_blocks(Bytes all, size_t count, std::vector<Bytes>& blocks, fhash_error& error) {
     std::vector<uint64_t> lengths(count, 0);
-    for (size_t i = 0; i < count; i++) {
-        if (i + 1 == count) lengths[i] = all.left();
-        else if (!all.leb(lengths[i]))
+    for (size_t i = 0; i + 1 < count; i++)
+        if (!all.leb(lengths[i]))
             return fail(error, FHASH_ERROR_DAMAGED, "the blocks of a tile are cut short");
-    }
     // The last length is that of all that is left; what the others take is not.
     uint64_t others = 0;
     for (size_t i = 0; i + 1 < count; i++) others += lengths[i];

@@ -53,10 +53,6 @@ struct Region {
 // Takes an inner chunk and its place in the grid of inner chunks.
 using Visit = std::function<bool(const Lengths& place, const Chunk& chunk)>;
 
-}  // namespace fhash
-
-namespace fhash {
-
 // The reads of an array so far, as far as they tell the next one.
 struct Course {
     Lengths first = {}, last = {};  // chunks of the last read

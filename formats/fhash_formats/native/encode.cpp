@@ -523,13 +523,6 @@ bool encode_about_origin(Task& task, const uint8_t* in_coreset, Coded& coded, fh
 
 }  // namespace
 
-void put_leb(Buffer& out, uint64_t number) {
-    do {
-        out.push_back((uint8_t)((number & 127) | (number > 127 ? 128 : 0)));
-        number >>= 7;
-    } while (number);
-}
-
 bool encode_predicted(const Predictor& predictor, const Shape& shape, const uint8_t* counted,
                       std::vector<int32_t>& integers, Buffer& out, fhash_error& error) {
     const State& prior = predictor_prior();

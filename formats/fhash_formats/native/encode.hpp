@@ -23,9 +23,6 @@ struct Coded {
     int64_t nonzero = 0;  // coded integers that are not 0
 };
 
-// A whole number as `Bytes::leb` reads it.
-void put_leb(Buffer& out, uint64_t number);
-
 // The bytes of an encoder, called again where they do not fit: encode(data, capacity) is the size.
 template <class Encode>
 bool with_room(int64_t room, Buffer& out, fhash_error& error, Encode encode) {

@@ -6,7 +6,7 @@
 
 #define FHASH_FUNCTIONS(FIND) \
     FIND(abi_version) FIND(array_announce) FIND(array_check) FIND(array_chunk) \
-    FIND(array_read) FIND(array_stored) FIND(chunk_free) FIND(file_cache) FIND(file_check) \
+    FIND(array_read) FIND(array_stored) FIND(chunk_free) FIND(file_cache) \
     FIND(file_digest) FIND(file_node) FIND(file_open) FIND(file_place) FIND(file_with) \
     FIND(between) FIND(clip_f32) FIND(clip_f64) FIND(correct_f32_f32) FIND(correct_f32_f64) \
     FIND(correct_f64_f32) FIND(correct_f64_f64) FIND(crc32c) FIND(decode) FIND(decode_block) \

@@ -95,7 +95,6 @@ int32_t fhash_file_with(fhash_context* context, const fhash_file* file, fhash_fi
 int32_t fhash_file_node(const fhash_file* file, int64_t number, fhash_node* node);
 int32_t fhash_file_place(const fhash_file* file, int32_t variable, int64_t number,
                          const char** name, int64_t* array);
-int32_t fhash_file_check(const fhash_file* file, int64_t number, fhash_error* error);
 int32_t fhash_file_digest(const fhash_file* file, char* digest);
 int32_t fhash_file_cache(const fhash_file* file, uint64_t bytes);
 int32_t fhash_array_read(fhash_file* file, int64_t array, const int64_t* bounds, int32_t keep,

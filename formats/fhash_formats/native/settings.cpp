@@ -30,6 +30,13 @@ bool Bytes::leb(uint64_t& value) {
     return false;
 }
 
+void put_leb(Buffer& out, uint64_t number) {
+    do {
+        out.push_back((uint8_t)((number & 127) | (number > 127 ? 128 : 0)));
+        number >>= 7;
+    } while (number);
+}
+
 namespace {
 
 constexpr int DOUBLE = 1, CLIP = 2, LABELS = 4, TRELLIS = 8;
@@ -401,10 +408,10 @@ bool insert_head(std::string& settings, const std::string& head, fhash_error& er
     if (!(first[0] & HEAD) != head.empty() ||
         (!head.empty() && (!read_block(data, block, error) || block.left())))
         return damaged(error, "they have a head of their own, or lack that of the header");
-    std::string length;
-    for (size_t left = head.size(); left; left >>= 7)
-        length += char((left & 127) | (left > 127 ? 128 : 0));
-    if (!head.empty()) settings.replace(place, 1, length + head);
+    if (head.empty()) return true;
+    Buffer length;
+    put_leb(length, head.size());
+    settings.replace(place, 1, std::string(length.begin(), length.end()) + head);
     return true;
 }
 

@@ -104,6 +104,9 @@ struct Bytes {
     bool leb(uint64_t& value);
 };
 
+// A whole number as `Bytes::leb` reads it.
+void put_leb(Buffer& out, uint64_t number);
+
 // A head from the block that settings have of it.
 bool unpack_head(Bytes block, Head& head, fhash_error& error);
 

@@ -41,7 +41,7 @@ bool read_table(fhash_file& file, const Array& table, int64_t key, const Lattice
 bool read_plain(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                 Frame& frame, fhash_error& error);
 
-// Adds to a mask where the occupancy of the box at a key frame is 1 (occupancy).
+// Adds to a mask where the occupancy of the box at a key frame is 1 (coreset, or occupancy).
 bool add_occupancy(fhash_file& file, const Variable& variable, int64_t key, const Lattice& lattice,
                    Buffer& mask, fhash_error& error);
 

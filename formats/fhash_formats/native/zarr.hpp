@@ -52,6 +52,8 @@ struct Node {
     uint32_t member;         // which is the document
 };
 
+constexpr char BASE64[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+
 struct Hierarchy {
     std::vector<JsonDocument> documents;
     std::vector<Node> nodes;  // in the order of the file

@@ -119,17 +119,6 @@ int32_t fhash_file_place(const fhash_file* file, int32_t variable, int64_t numbe
     return 1;
 }
 
-// Checks the document of node `number`, also where the root has a copy of it.
-int32_t fhash_file_check(const fhash_file* file, int64_t number, fhash_error* error) {
-    return reported(error, [&](fhash_error& failed) {
-        const Node& node = file->opened->hierarchy.nodes[size_t(number)];
-        const Member& member = file->directory.members[node.member];
-        Buffer stored, data;
-        return file->source.read(member.offset, member.end() - member.offset, stored, failed) &&
-               open_member(member, stored.data(), data, failed);
-    });
-}
-
 // SHA-256 of the directory as 64 hexadecimal digits and a zero byte.
 int32_t fhash_file_digest(const fhash_file* file, char* digest) {
     std::memcpy(digest, file->opened->directory.digest, 65);

@@ -231,7 +231,8 @@ struct Indices {
         return made;
     }
 
-    // Finds the member of an inner chunk, and its number there; the place, where it is alone.
+    // The number of the member of an inner chunk, which gets that of itself there and the bytes of
+    // the whole member.
     uint64_t find_member(Wanted& wanted) const {
         uint64_t number = 0;
         wanted.within = 0;
@@ -267,10 +268,10 @@ struct Indices {
             const ChunkPointer found = starts(each.first, error);
             if (!found) return false;
             for (Wanted* one : each.second) {
-                const uint8_t* const at = found->values.data() + 8 * one->within;
-                const uint64_t start = from_little(at, 8), stop = from_little(at + 8, 8);
-                one->stored.offset += one->stored.skip + start;
-                one->stored.length = stop - start;
+                uint64_t ends[2];
+                std::memcpy(ends, found->values.data() + 8 * one->within, sizeof ends);
+                one->stored.offset += one->stored.skip + ends[0];
+                one->stored.length = ends[1] - ends[0];
                 one->stored.skip = 0;
             }
         }

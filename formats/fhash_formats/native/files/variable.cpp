@@ -222,13 +222,17 @@ bool read_coordinates(std::vector<Variable>& all, size_t number, fhash_error& er
     return true;
 }
 
-constexpr char LETTERS[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 constexpr int MIDDLE = 31;  // letter of a weight of 0
 
-template <class T> void add_bytes(std::string& block, T value) {
-    char bytes[sizeof value];
-    std::memcpy(bytes, &value, sizeof value);
-    block.append(bytes, sizeof value);
+void add_number(std::string& block, uint32_t bits, int bytes) {
+    for (int i = 0; i < bytes; i++) block += char(bits >> 8 * i);
+}
+
+void add_float(std::string& block, double number) {
+    const float value = float(number);
+    uint32_t bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    add_number(block, bits, 4);
 }
 
 // The MLP in the header, as the block that settings of tiles have of it.
@@ -253,19 +257,19 @@ bool read_mlp(Variable& variable, fhash_error& error) {
         block += char(widths[i]);
         all += size_t(widths[i]);
     }
-    for (const double each : constants) add_bytes(block, float(each));
+    for (const double each : constants) add_float(block, each);
     double scales[8];
     if (!mlp.numbers("scales", 2 * (count + 1), scales, error)) return false;
-    for (size_t i = 0; i < 2 * (count + 1); i++) add_bytes(block, to_half(scales[i]));
+    for (size_t i = 0; i < 2 * (count + 1); i++) add_number(block, to_half(scales[i]), 2);
     if (!mlp.integers("biases", all, -127, 127, biases, error) ||
         !mlp.text("weights", weights, error))
         return false;
     for (size_t i = 0; i < all; i++) block += char(biases[i]);
     for (const char letter : weights) {
-        const char* const place = std::strchr(LETTERS, letter);
+        const char* const place = std::strchr(BASE64, letter);
         if (!mlp.need(place && letter && letter != '/', "weights", "letters of base64", error))
             return false;
-        block += char(int(place - LETTERS) - MIDDLE);
+        block += char(int(place - BASE64) - MIDDLE);
     }
     const uint8_t* const begin = reinterpret_cast<const uint8_t*>(block.data());
     Head head;
@@ -448,8 +452,7 @@ bool check_format(Json header, fhash_error& error) {
         !top.need(format == "fhash", "format", "fhash", error) ||
         !top.integers("format_version", 2, 0, 10000, version, error))
         return false;
-    if (version[0] != MAJOR)
-        return refuse_version(int(version[0]), error);
+    if (version[0] != MAJOR) return refuse_version(int(version[0]), error);
     const Json list = top.find("required_features");
     if (!top.need(yyjson_is_arr(list), "required_features", "a list of texts", error)) return false;
     std::vector<std::string> names;

@@ -67,18 +67,16 @@ uint64_t product_within(const Lengths& lengths, int axes, uint64_t most) {
 }
 
 bool from_base64(const char* text, size_t size, std::string& bytes) {
-    static const char LETTERS[] =
-        "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     if (size % 4) return false;
     for (size_t i = 0; i < size; i += 4) {
         uint32_t group = 0;
         int pads = 0;
         for (size_t k = 0; k < 4; k++) {
             const char letter = text[i + k];
-            const char* place = letter ? std::strchr(LETTERS, letter) : nullptr;
+            const char* place = letter ? std::strchr(BASE64, letter) : nullptr;
             if (letter == '=' && i + 4 == size && k >= 2) pads++;
             if ((letter != '=' || !pads) && (!place || pads)) return false;
-            group = group << 6 | uint32_t(place ? place - LETTERS : 0);
+            group = group << 6 | uint32_t(place ? place - BASE64 : 0);
         }
         for (int k = 2; k >= pads; k--) bytes += char(group >> 8 * k);
     }

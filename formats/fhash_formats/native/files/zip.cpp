@@ -285,8 +285,7 @@ bool read_directory(Source& source, Directory& found, fhash_error& error) {
         return fail(error, FHASH_ERROR_DAMAGED,
                     "not an fhash container, or one that was cut short: no fhash signature at its "
                     "end");
-    if (major != MAJOR)
-        return refuse_version(major, error);
+    if (major != MAJOR) return refuse_version(major, error);
     const uint64_t comment_at = source.tail_at + start;
     End end;
     Buffer directory;
