@@ -74,7 +74,7 @@ class Report(Sizes):
     tables_loss_db: Annotated[float | None, "dB that coded tables lose at the key frames"]
     device: Annotated[Literal["cpu", "cuda"], "where it was trained"]
     restarts: Annotated[int, "times that the training diverged and began again, slower"]
-    gains: Annotated[list[Gain], "what the search went through; empty for the published network"]
+    gains: Annotated[list[Gain], "what the search went through; empty without `--timings`"]
     quality: Annotated[dict[str, Any], Quality, "all figures of the quality"]
 
 

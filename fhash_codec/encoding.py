@@ -266,7 +266,7 @@ class _Measured:
 
 def _take_decoded(container: Container, decoded: DecodedTiles) -> None:
     """Give a container the decoded values of its table, so that it decodes few tiles of them."""
-    name = "tables/level_1"
+    name = "table_1"
     for number, (index, values) in enumerate(decoded.items()):
         if number % DECODED_AGAIN == 0:
             read = container.arrays[name].decode_chunk(index)

@@ -28,7 +28,7 @@ class Gain(TypedDict):
 
     what: Annotated[str, "the part"]
     bytes: Annotated[int, "size of the file after it, estimated but for the last"]
-    seconds: NotRequired[Annotated[float, "since the search began; with `--timings` alone"]]
+    seconds: Annotated[float, "since the search began"]
 
 
 class BulkFigures(TypedDict):

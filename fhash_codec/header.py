@@ -310,7 +310,9 @@ DIGITS = 6
 """Significant digits of a figure over all steps."""
 
 GAIN = ("what", "bytes", "seconds")
-"""Entries of a list in `model.gains`, in this order; the last one is left out with the times."""
+"""Entries of a list in `model.gains`, in this order."""
+SEARCH = ("gains", "tiling")
+"""Keys of the model that tell of the search, with the times alone."""
 
 STEP_DIGITS = 5
 """Significant digits of a figure of one step."""
@@ -355,7 +357,7 @@ def describe_source(
     source, _ = described_source(series, _storable_coords(series), variable["attributes"])
     return {
         **({} if source is None else {SOURCE: source | date_of(config)}),
-        "encoder": {"version": version("fhash"), "seed": config.seed},
+        "encoder": {"version": version("fhash")},
         "variable": variable,
         "domain": {"shape": list(series.shape)},
         "value_range": [value_range.low, value_range.high],

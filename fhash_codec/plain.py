@@ -49,7 +49,7 @@ CHUNK_BYTES = 2 << 20
 
 TAKEN = {
     *(BITS_ARRAY, CORESET_ARRAY, MISSING_ARRAY, STEPS),
-    *("key_frames", "corrections", "tables", "mlp", "auxiliary", "whole", "step_errors"),
+    *("key_frames", "corrections", "mlp", "auxiliary", "whole", "step_errors"),
 }
 """Names of arrays and groups in the root of a file of one variable."""
 SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
@@ -131,9 +131,9 @@ class _Export:
         coded = [
             table
             for table in self._volume.tables
-            if SPARSE in model or f"tables/level_{table.level}" not in self._arrays
+            if SPARSE in model or f"table_{table.level}" not in self._arrays
         ]
-        levels = (f"tables/level_{table.level}/" for table in coded)
+        levels = (f"table_{table.level}/" for table in coded)
         masks = (f"{CORESET_ARRAY}/", f"{BITS_ARRAY}/") if CORESET_ARRAY in self._arrays else ()
         rewritten = (*levels, f"{LAYERS}/", *masks)
         copied = {
@@ -169,7 +169,7 @@ class _Export:
     def compact(self) -> dict[str, Any]:
         """Write another model: all levels, the head, bits, and corrections."""
         volume = self._volume
-        array = self._arrays["tables/level_1"]
+        array = self._arrays["table_1"]
         tables, settings = volume.tables, array.settings
         # A head takes differences from the origin, and plain tables have none; what it would do is
         # in the corrections then.
@@ -179,7 +179,7 @@ class _Export:
         self._total = 2 * tiles + keys + sum(map(_chunk_count, tables[1:]))
         self._write_axes()
         self._write_tiles(
-            "tables/level_1",
+            "table_1",
             array,
             tables[0].dtype,
             lambda index: self._table(array, index)[..., np.newaxis],
@@ -235,7 +235,7 @@ class _Export:
                 self._tick(f"level {table.level}")
 
         self._writer.add_array(
-            f"tables/level_{table.level}",
+            f"table_{table.level}",
             shape=table.shape,
             dtype=table.dtype,
             chunk_shape=chunk,
@@ -258,7 +258,7 @@ class _Export:
                 yield read(index)
                 self._tick(name)
 
-        extra = (1,) if name.startswith("tables/") else ()
+        extra = (1,) if name.startswith("table_") else ()
         self._writer.add_array(
             name,
             shape=(*array.shape, *extra),
@@ -350,8 +350,8 @@ def _nodes(names: Sequence[str]) -> list[str]:
     """
     found: list[str] = []
     for axis, name in zip(AXES, names, strict=True):
-        good = re.fullmatch(r"[A-Za-z0-9-][A-Za-z0-9_-]{0,80}", name) and name not in TAKEN
-        free = name if good and name not in found else f"axis_{axis}"
+        good = re.fullmatch(r"(?!table_)[A-Za-z0-9-][A-Za-z0-9_-]{0,80}", name)
+        free = name if good and name not in {*TAKEN, *found} else f"axis_{axis}"
         found.append(free if free not in found else f"axis_{axis}_")
     return found
 

@@ -139,7 +139,7 @@ class Card:
                     "level": table.level,
                     "shape": list(table.shape),
                     "dtype": table.dtype.name,
-                    **self._stored(f"tables/level_{table.level}", "low-passed level 1"),
+                    **self._stored(f"table_{table.level}", "low-passed level 1"),
                 }
                 for table in self.tables
             ],

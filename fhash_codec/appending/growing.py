@@ -29,7 +29,7 @@ from fhash_codec.compact.tiles import (
     padded_tile,
 )
 from fhash_codec.config import EncodeConfig
-from fhash_codec.header import brief_quality, full_header
+from fhash_codec.header import SEARCH, brief_quality, full_header
 from fhash_codec.measure.errors import Errors, ErrorSums, error_sums
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_formats.container import (
@@ -530,14 +530,13 @@ def _coder(
 
 def _lasting(header: Mapping[str, Any]) -> dict[str, Any]:
     """The entries of a full header that stay the same while the file grows."""
-    encoder = {name: header["encoder"][name] for name in ("version", "seed")}
-    model = {name: value for name, value in header["model"].items() if name != "tiling"}
+    model = {name: header["model"][name] for name in header["model"] if name not in SEARCH}
     config = {**header["config"], "max_error": bound_of_file(header), "max_error_rel": None}
     return {
         **header,
         **({SOURCE: _lasting_source(header[SOURCE])} if SOURCE in header else {}),
-        "encoder": encoder,
-        "model": {**model, "gains": []},
+        "encoder": {"version": header["encoder"]["version"]},
+        "model": model,
         "config": config,
     }
 

@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.appending.series_plan import DIGESTS, SeriesPlan, bounded, code_layers
-from fhash_codec.compact.encode import all_tiles
 from fhash_codec.compact.tiles import Blocks, CodedTiles
 from fhash_codec.comparison import Report, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
@@ -51,7 +50,10 @@ from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.tile_format import TileSettings
 
 PART = "part"
-"""Key of a part's header: which part it is, of how many steps of what."""
+"""Key of a part's header: its `number`, from 1, `of` so many parts; `first`, its first step in the
+whole, and the `steps` of that; `size` and `nonzero`, bytes of its tiles and coefficients in them
+other than 0; `ssim_steps`, the steps of the whole whose SSIM counts; `source`, that of the whole,
+in part 1 alone. Part i of N has the layers of tiles from floor(L (i - 1) / N) to floor(L i / N)."""
 ERRORS = "step_errors"
 """Array of a part: sums of the errors of each step, of which the figures of the whole follow."""
 WHOLE = "whole/"
@@ -272,7 +274,6 @@ class _Job:
         own["required_features"] = ["transform"]
         own["model"]["levels"] = [list(parts.shape)]
         own["model"]["parameters"] += coded.outcome.nonzero
-        own["model"]["gains"].append(all_tiles(coded.outcome.size))
         gaps = plan.samples < prod(self.series.shape)
         told = describe_source(steps, value_range, plan.config, gaps=gaps)
         return {**told, **described, **own, PART: source}
@@ -320,7 +321,7 @@ MOST_ERROR = 4.0
 """Largest error, and square of one, with the range of the values scaled to at most 1."""
 OWN = ("coordinates", "domain", "quality", "required_features", SOURCE, PART)
 """Keys of a part's header that differ from part to part."""
-OWN_MODEL = ("levels", "parameters", "gains")
+OWN_MODEL = ("levels", "parameters")
 """Keys of its model that do."""
 OWN_VARIABLE = ("fill", NOT_STORED)
 """Keys of its variable that do: of values that some steps alone have."""
@@ -428,8 +429,6 @@ class _Piece:
             raise DamagedFileError(f"{self.path}: array {ERRORS} is missing or does not fit")
         if table is None or not isinstance(table.settings, TileSettings):
             raise DamagedFileError(f"{self.path}: array {TABLE} has no settings of all tiles")
-        if not isinstance(header["model"].get("gains"), list):
-            raise DamagedFileError(f"{self.path}: header key model.gains is missing or no list")
         bits = container.arrays.get(BITS_ARRAY)
         exact = bits is not None and BLOCK not in bits.attributes
         if has_blocks(table.masked, header["features"]) and not exact:
@@ -460,7 +459,6 @@ class _Piece:
                 if name not in OWN_VARIABLE
             },
             "model": model,
-            "gains": header["model"]["gains"][:-1],
             "frame": header["domain"]["shape"][1:],
             "bulk": (header["quality"].get("bulk") or {}).get("range"),
             "tile": self.table.chunk_shape,
@@ -677,8 +675,6 @@ class _Whole:
         weights = model["parameters"] - first.nonzero
         model["levels"] = [list(table.shape)]
         model["parameters"] = sum(part.nonzero for part in self._parts) + weights
-        last = all_tiles(sum(part.size for part in self._parts))
-        model["gains"] = [*model["gains"][:-1], last]
         return model
 
     def _quality(self, value_range: ValueRange, background: float) -> dict[str, Any]:

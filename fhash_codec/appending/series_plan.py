@@ -326,8 +326,6 @@ class SeriesPlan:
             raise DamagedFileError(f"tiles of {recipe.tile} are larger than the series")
         for key, kind in (("model", Mapping), ("quality", Mapping), ("encoder", Mapping)):
             record.need(isinstance(header.get(key), kind), "header", f"an object {key}")
-        gains = header["model"].get("gains")
-        record.need(isinstance(gains, list), "header", "a list model.gains")
         record.record("header").record("model").integer("parameters", 0, 1 << 62)
         return cls(
             config=bounded(EncodeConfig.from_dict(config)),

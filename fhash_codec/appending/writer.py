@@ -134,8 +134,6 @@ def plan_layers(
     )
     header = table_header(series, selection, CodedTable(plan=found), promised, None)
     del header["quality"]
-    header["model"] = {**header["model"], "gains": []}
-    header["model"].pop("tiling", None)
     return coder, {**header, "dilation": promised.dilation}
 
 

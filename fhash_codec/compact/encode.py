@@ -106,7 +106,7 @@ class CodedTable:
         )
 
 
-def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
+def model_header(table: CodedTable) -> dict[str, Any]:
     """Return what the header of a compact file says of its model."""
     blocks, head = table.plan.blocks, table.plan.settings.head
     weights = 0 if head is None else head.size
@@ -116,19 +116,15 @@ def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
         "embedding_size": 1,
         "tables": blocks.source_dtype.name,
         "parameters": table.outcome.nonzero + weights,
-        "gains": [
-            [gain[name] for name in (GAIN if config.timings else GAIN[:-1]) if name in gain]
-            for gain in table.plan.gains
-        ],
     }
 
 
-def tiling_header(table: CodedTable) -> dict[str, Any] | None:
-    """Return what a header says of the tiles; None where there is nothing to say.
+def search_header(table: CodedTable) -> dict[str, Any]:
+    """Return what a header with times says of the search: `gains`, and `tiling` if there is any.
 
-    Keys: `price`, bytes as a multiple of those of the best tiling; `tried`, the number of tilings
-    that were priced, 0 where the price is estimated; `coder`, "fast" where the tiles are of the
-    fast coder. Tiles that were asked for have the last one alone.
+    Keys of `tiling`: `price`, bytes as a multiple of those of the best tiling; `tried`, the number
+    of tilings that were priced, 0 where the price is estimated; `coder`, "fast" where the tiles are
+    of the fast coder. Tiles that were asked for have the last one alone.
     """
     record: dict[str, Any] = {}
     tiling = table.plan.tiling
@@ -139,7 +135,8 @@ def tiling_header(table: CodedTable) -> dict[str, Any] | None:
         }
     if table.plan.coding.fast:
         record["coder"] = "fast"
-    return record or None
+    gains = [[gain[name] for name in GAIN if name in gain] for gain in table.plan.gains]
+    return {"gains": gains, **({"tiling": record} if record else {})}
 
 
 SIZE_PASSES = 10
@@ -282,7 +279,8 @@ def code_series(
             other = _code_all(replace(exact, goal=goal), workers, progress)
             table = other if other.outcome.size < table.outcome.size else table
     seconds = round(time.perf_counter() - begun, 3)
-    gain = dict(zip(GAIN, (*all_tiles(table.outcome.size), seconds), strict=True))
+    size = table.outcome.size + OVERHEAD_BYTES
+    gain = dict(zip(GAIN, ("all tiles", size, seconds), strict=True))
     table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
     return replace(table, bulk=bulk)
 
@@ -359,11 +357,6 @@ def plan_series(
     asked = integer_goal(0, goal.data_range) if beyond else goal
     coding_plan = plan(blocks, about, config, asked, workers, progress, selection.features)
     return coding_plan, goal, None if bulk is None else bulk.moved(origin)
-
-
-def all_tiles(size: int) -> list[Any]:
-    """Return the last entry of a header's gains: tiles of so many bytes."""
-    return ["all tiles", size + OVERHEAD_BYTES]
 
 
 def resized(table: CodedTable, overhead: int, progress: Progress) -> CodedTable:
@@ -683,13 +676,11 @@ def table_header(
     """
     extent = selection.extent
     kept = table.plan.history if table.plan.settings.head is not None else []
-    tiling = tiling_header(table)
     with stage("between steps", "linear or cubic, on steps that are left out"):
         between = choose_between(series, extent, selection.scanned.value_range)
     return {
         "encoder": {
             "version": version("fhash"),
-            "seed": config.seed,
             **({} if seconds is None else {"seconds": seconds}),
         },
         "background": extent.background,
@@ -697,8 +688,8 @@ def table_header(
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
         "model": {
-            **model_header(table, config),
-            **({} if tiling is None else {"tiling": tiling}),
+            **model_header(table),
+            **(search_header(table) if config.timings else {}),
             **between,
         },
         "config": config.settings() | promise(config, selection.scanned.value_range, table.bulk),

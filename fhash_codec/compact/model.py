@@ -178,7 +178,7 @@ class PlainArray:
         arrays: Mapping[str, StoredArray],
     ) -> None:
         self._model, self._mlp = model, mlp
-        self._table = arrays["tables/level_1"]
+        self._table = arrays["table_1"]
         self._corrections = arrays.get("corrections")
         self.shape = self._table.shape[:4]
         self.chunk_shape = tuple(model["tile"])
@@ -377,7 +377,7 @@ class CompactModel:
         """The tables, finest first."""
         if self._plain is not None:
             levels = range(1, self._plain.levels + 1)
-            stored = {n: self._arrays[f"tables/level_{n}"] for n in levels}
+            stored = {n: self._arrays[f"table_{n}"] for n in levels}
             return [Table(n, array, array.dtype) for n, array in stored.items()]
         count = level_count(self._table.shape[1:])
         sources = [CompactTable(self._table, halvings) for halvings in range(count)]

@@ -40,7 +40,6 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.series import AXES, Series, index_coordinate
 from fhash_formats.support.values import Mask, Single
 from fhash_formats.transform.tile import plain_step
-from fhash_formats.transform.tile_format import TileSettings
 
 Matrix = npt.NDArray[np.float64]
 Tables = list[list[CodedTable]]
@@ -154,7 +153,7 @@ class ModelCoding:
         samples: those of the training.
         components: those of each level, finest first.
         layers: weight and bias of each layer, as the file gets them.
-        layer_settings: how the weights of each are coded; None for plain numbers.
+        scales: of weight and bias of each layer in turn; None for plain numbers.
         exact: mean squared error of the trained model at the samples.
         error: the same with the layers of the file.
         in_reach: whether the trained model keeps the promise; False without one.
@@ -164,6 +163,7 @@ class ModelCoding:
         tried: logarithms of `step` that were too low and too high.
         kept: of the codings before this one whose file kept the promise the one with the largest
             error, and what it was missing, below 0; None without one.
+        nearest: of all before this one that whose file came nearest to the promise, likewise.
         writings: how often the model was written, this time included.
     """
 
@@ -171,7 +171,7 @@ class ModelCoding:
     samples: Samples
     components: list[list[Component]]
     layers: list[Layer]
-    layer_settings: list[TileSettings | None]
+    scales: list[float] | None
     exact: float
     error: float
     in_reach: bool
@@ -180,6 +180,7 @@ class ModelCoding:
     tables: Tables
     tried: Bracket = field(default_factory=lambda: Bracket(-math.inf, math.inf))
     kept: tuple[float, ModelCoding] | None = None
+    nearest: tuple[float, ModelCoding] | None = None
     writings: int = 1
 
     @classmethod
@@ -208,13 +209,15 @@ class ModelCoding:
         in_reach = allowed > exact
         if not in_reach:
             allowed = max(exact * 10 ** (MAX_LOSS / 10), MIN_ERROR)
-        few = samples.error_of_few(network(model.layers))
-        layers, layer_settings = quantised_layers(
-            model.layers,
-            lambda changed: samples.error_of_few(network(changed)),
-            few + LAYERS_SHARE * (allowed - exact),
-        )
-        error = max(exact + samples.error_of_few(network(layers)) - few, 0.0)
+        few, share = samples.error_of_few(network(model.layers)), LAYERS_SHARE * (allowed - exact)
+
+        def added(layers: Sequence[Layer]) -> float:
+            """The error that layers add: at few samples, and at all where it is small there."""
+            quick = samples.error_of_few(network(layers)) - few
+            return quick if quick > share else samples.error(network(layers)) - exact
+
+        layers, scales, more = quantised_layers(model.layers, added, share)
+        error = exact + more
         slopes = samples.slopes(network(layers)).astype(np.float64)
         components = _components(architecture, samples.count, tables, slopes)
         step, coded = _coded(components, samples.count * (allowed - error), progress)
@@ -223,7 +226,7 @@ class ModelCoding:
             samples=samples,
             components=components,
             layers=layers,
-            layer_settings=layer_settings,
+            scales=scales,
             exact=exact,
             error=error,
             in_reach=in_reach,
@@ -242,7 +245,7 @@ class ModelCoding:
             ):
                 mixing = [float(str(each)) for each in component.mixing]
                 table.parts.write(writer, component_name(level, number), {"mixing": mixing})
-        write_layers(writer, self.layers, self.layer_settings)
+        write_layers(writer, self.layers, self.scales)
         write_mask(writer, self.coreset)
 
     def loss(self, network: Network) -> float:
@@ -267,32 +270,39 @@ class ModelCoding:
         enough = missing <= 0 and self.unused(missing) < EXCESS
         if math.isinf(missing) or enough or self.writings == WRITINGS:
             return None
-        kept = self.kept
+        kept, nearest, alone = self.kept, self.nearest, replace(self, kept=None, nearest=None)
         if missing <= 0 and (kept is None or missing > kept[0]):
-            kept = missing, replace(self, kept=None)
+            kept = missing, alone
+        if nearest is None or abs(missing) < abs(nearest[0]):
+            nearest = missing, alone
         of_coding = self.exact * 10 ** (loss / 10) - self.error
         if self.allowed * (10 ** (missing / 10) - 1) > of_coding:
             return None  # more is missing than coding has cost
         number = self.writings + 1
         if number == WRITINGS:
             return kept and replace(kept[1], writings=WRITINGS)
+        found = replace(self, kept=kept, nearest=nearest, writings=number)
         if number > COMMON and kept is not None:
-            tables = kept[1]._with_larger_step(kept[0], number % len(self.tables), progress)
-            return replace(self, tables=tables, kept=kept, writings=number)
+            turns, level = divmod(number - COMMON - 1, len(self.tables))
+            tables = nearest[1]._with_other_step(nearest[0], level, 0.5**turns, progress)
+            return replace(found, tables=tables)
         tried = self.tried.narrowed(math.log(self.step), too_low=missing <= 0)
         change = min(max(self.unused(missing) - NEAR, -MOST), MOST)
         step = math.exp(tried.inside(math.log(self.step) + change / SLOPE))
         tables = _at_step(self.tables, step, progress)
-        return replace(self, step=step, tables=tables, tried=tried, kept=kept, writings=number)
+        return replace(found, step=step, tables=tables, tried=tried)
 
-    def _with_larger_step(self, missing: float, level: int, progress: Progress) -> Tables:
-        """Return the tables, one level with the step that adds the error that is left.
+    def _with_other_step(
+        self, missing: float, level: int, share: float, progress: Progress
+    ) -> Tables:
+        """Return the tables, one level with the step that adds a share of the error that is left.
 
         The error of small tables jumps from one step of all levels to the next.
         """
-        left = (self.allowed - self.error) * (1 - 10 ** (-self.unused(missing) / 10))
+        left = share * (self.allowed - self.error) * (1 - 10 ** (-self.unused(missing) / 10))
         own = sum(table.outcome.squares for table in self.tables[level]) / self.samples.count
-        gain = min(10 * math.log10(1 + left / own), MOST) if own > 0 else MOST
+        change = 1 + left / own if own > 0 else math.inf
+        gain = min(max(10 * math.log10(max(change, 1e-9)), -MOST), MOST)
         tables = list(self.tables)
         step = step_after_gain(plain_step(tables[level][-1].plan.settings), gain)
         tables[level] = [at_step(each, step, progress) for each in tables[level]]

@@ -26,7 +26,7 @@ from fhash_codec.paper.network import (
     SparseFrame,
 )
 from fhash_formats.container import Container, ContainerWriter, StoredArray
-from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE, LAYERS
+from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE, LAYERS, SCALES
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.values import Longs, Mask, Single
 
@@ -502,14 +502,20 @@ def _layers(container: Container) -> tuple[Layer, ...]:
             (arrays[name.format("weight")].read(), arrays[name.format("bias")].read())
             for name in names
         )
-    ends = np.cumsum([outputs * (inputs + 1) for outputs, inputs in shapes])
-    parts = zip(np.split(arrays[LAYERS].read(), ends[:-1]), shapes, strict=True)
-    return tuple((part[:-n].reshape(n, inputs), part[-n:]) for part, (n, inputs) in parts)
+    sizes = [size for outputs, inputs in shapes for size in (outputs * inputs, outputs)]
+    numbers = np.split(arrays[LAYERS].read().astype(np.float32), np.cumsum(sizes)[:-1])
+    if arrays[LAYERS].dtype == np.int16:
+        scales = np.array(arrays[LAYERS].attributes[SCALES], np.float32)
+        numbers = [part * scale for part, scale in zip(numbers, scales, strict=True)]
+    return tuple(
+        (weight.reshape(shape), bias)
+        for weight, bias, shape in zip(numbers[::2], numbers[1::2], shapes, strict=True)
+    )
 
 
 def table_name(level: int) -> str:
     """Return the name of the array of a level, counted from 1, that is stored as numbers."""
-    return f"tables/level_{level}"
+    return f"table_{level}"
 
 
 def component_name(level: int, component: int) -> str:

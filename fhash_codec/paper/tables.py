@@ -16,10 +16,9 @@ from fhash_codec.paper.network import Architecture, Layer, Network
 from fhash_codec.paper.storage import Bricks, needed_by, write_occupancy
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.array import transform_codecs
-from fhash_formats.container.header import CORESET_ARRAY, LAYERS, MASK_FEATURES
+from fhash_formats.container.header import CORESET_ARRAY, LAYERS, MASK_FEATURES, SCALES
 from fhash_formats.support.values import Double, Longs, Mask, Single
 from fhash_formats.transform.spec import TransformSpec
-from fhash_formats.transform.tile import Coding, encode_tile
 from fhash_formats.transform.tile_format import TileSettings
 
 Region = tuple[slice, ...]
@@ -183,57 +182,74 @@ def _error(network: Network, groups: Iterable[Points]) -> float:
     return fsum(squares) / count
 
 
-MIN_WEIGHTS = 512
-"""Smallest matrix that is quantised: the description of its coding takes some 200 bytes."""
 WEIGHT_STEPS = tuple(2.0**-power for power in range(2, 13))
-"""Quantiser steps tried for the weights of a matrix, as shares of their root mean square."""
+"""Scales tried for the weights of a matrix, as shares of their root mean square."""
+MOST = 32767
+"""Largest whole number of a layer in a file: int16."""
 MASK_VERTICES = 4 << 20
 """Vertices of a tile of masks; a frame is read by decoding one tile."""
-_PLAIN = TransformSpec.from_dict(dict.fromkeys("tzyx", "none"))
 
 
 def quantised_layers(
     layers: Sequence[Layer], error: Callable[[Sequence[Layer]], float], allowed: float
-) -> tuple[list[Layer], list[TileSettings | None]]:
-    """Return layers with quantised weights, and how each matrix is coded.
+) -> tuple[list[Layer], list[float] | None, float]:
+    """Return layers whose numbers are whole multiples of a scale, and the scales.
 
-    The step is the largest at which the error of the model stays allowed.
+    Weights have the largest scale of those tried at which the error stays allowed.
 
     Args:
         layers: weight and bias of each layer.
-        error: mean squared error of the model with some layers.
-        allowed: largest error.
+        error: that some layers add to the mean squared error of the model.
+        allowed: the most of it.
 
     Returns:
-        The layers as the file will have them, and the settings of each matrix; None for a matrix
-        that is not quantised.
+        The layers as the file will have them, the scales of weight and bias of each layer in turn,
+        and the error that they add; the layers as they are, None and 0 where no scale is allowed.
     """
     for share in WEIGHT_STEPS:
-        settings = [_weight_settings(weight, share) for weight, _ in layers]
-        quantised = [
-            (weight if how is None else _decoded(weight, how), bias)
-            for (weight, bias), how in zip(layers, settings, strict=True)
+        scales = [
+            float(str(np.float32(scale)))
+            for weight, bias in layers
+            for scale in (share * _root_mean_square(weight), np.abs(bias).max() / MOST)
         ]
-        if error(quantised) <= allowed:
-            return quantised, settings
-    return list(layers), [None] * len(layers)
+        numbers = _whole_numbers(layers, scales)
+        if any(np.abs(each).max() > MOST for each in numbers):
+            continue
+        found = [
+            (each * np.float32(k)).astype(np.float32)
+            for each, k in zip(numbers, scales, strict=True)
+        ]
+        quantised = list(zip(found[::2], found[1::2], strict=True))
+        more = error(quantised)
+        if more <= allowed:
+            return quantised, scales, more
+    return list(layers), None, 0.0
+
+
+def _root_mean_square(numbers: Single) -> float:
+    return float(np.sqrt(np.square(numbers, dtype=np.float64).mean()))
+
+
+def _whole_numbers(layers: Sequence[Layer], scales: Sequence[float]) -> list[Single]:
+    """The numbers of weight and bias of each layer in turn, as multiples of its scale."""
+    parts = [part for layer in layers for part in layer]
+    return [
+        np.rint(part / np.float32(scale or 1.0)) for part, scale in zip(parts, scales, strict=True)
+    ]
 
 
 def write_layers(
-    writer: ContainerWriter, layers: Sequence[Layer], settings: Sequence[TileSettings | None]
+    writer: ContainerWriter, layers: Sequence[Layer], scales: Sequence[float] | None
 ) -> None:
-    """Write the layers of `quantised_layers`: as one array, unless some are coded.
-
-    An array takes some 500 bytes beside its numbers.
-    """
-    if not any(settings):
-        numbers = [part.ravel() for layer in layers for part in layer]
-        writer.add_whole(LAYERS, np.concatenate(numbers))
-        return
-    for number, ((weight, bias), how) in enumerate(zip(layers, settings, strict=True), start=1):
-        codecs = None if how is None else transform_codecs(how)
-        writer.add_whole(f"mlp/weight_{number}", weight, codecs=codecs)
-        writer.add_whole(f"mlp/bias_{number}", bias)
+    """Write the layers of `quantised_layers` as one array; one takes some 500 bytes by itself."""
+    numbers = [part for layer in layers for part in layer]
+    if scales is not None:
+        numbers = _whole_numbers(layers, scales)
+    together = np.concatenate([each.ravel() for each in numbers])
+    if scales is None:
+        writer.add_whole(LAYERS, together)
+    else:
+        writer.add_whole(LAYERS, together.astype(np.int16), attributes={SCALES: list(scales)})
 
 
 def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
@@ -265,7 +281,7 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
         ),
         codecs=transform_codecs(
             TileSettings(
-                transform=_PLAIN,
+                transform=TransformSpec.from_dict(dict.fromkeys("tzyx", "none")),
                 step=1.0,
                 center=0.0,
                 low=0.0,
@@ -280,24 +296,3 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
         (keys, *box),
         writer.mark().position,  # all that the file has so far: tables, network and masks
     )
-
-
-def _weight_settings(weight: Single, share: float) -> TileSettings | None:
-    """Return the settings of a matrix for a step, as a share of the root mean square."""
-    size = float(np.sqrt(np.square(weight, dtype=np.float64).mean()))
-    if weight.size < MIN_WEIGHTS or not size > 0:
-        return None
-    return TileSettings(
-        transform=_PLAIN,
-        step=float(str(np.float32(share * size))),
-        center=0.0,
-        low=float(str(weight.min())),
-        high=float(str(weight.max())),
-    )
-
-
-def _decoded(weight: Single, settings: TileSettings) -> Single:
-    """Return a matrix as a reader of the file gets it."""
-    shape = weight.shape
-    tile = encode_tile(weight.reshape(1, 1, *shape), settings, Coding())
-    return np.ascontiguousarray(tile.decoded.reshape(shape))

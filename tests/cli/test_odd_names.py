@@ -14,7 +14,19 @@ from command_line import Fhash
 pytestmark = pytest.mark.filterwarnings("default::fhash_formats.errors.FhashWarning")
 VALUES = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5) + 1
 QUICK = ["--max-error", "0.01", "--effort", "1", "-q", "--force"]
-NAMES = ["zeta ", " ", "a/b", "..", "a\nb", "__x", "zarr.json", "y" * 300, "tables", "\u03be", "%d"]
+NAMES = [
+    "zeta ",
+    " ",
+    "a/b",
+    "..",
+    "a\nb",
+    "__x",
+    "zarr.json",
+    "y" * 300,
+    "table_1",
+    "\u03be",
+    "%d",
+]
 
 
 @pytest.mark.parametrize("name", NAMES, ids=map(ascii, NAMES))

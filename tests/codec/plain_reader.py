@@ -82,7 +82,7 @@ def values(path, key):
     (header,) = root.attrs["fhash"]["variables"]
     model, (low, high), mlp = header["model"], header["value_range"], header.get("mlp")
     lengths, layers = model["levels"][0], layers_of(mlp) if mlp else []
-    tables = [root[f"tables/level_{n + 1}"] for n in range(len(model["levels"]))]
+    tables = [root[f"table_{n + 1}"] for n in range(len(model["levels"]))]
     if model["profile"] == "paper":
         at = [[key], *map(np.arange, lengths[1:])]
         inputs = np.concatenate([interpolated(table, lengths, at) for table in tables])

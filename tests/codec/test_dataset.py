@@ -81,7 +81,7 @@ def test_a_dataset_is_a_mapping_of_volumes(run: tuple[Arrays, Path]) -> None:
         dataset["v"].close()
         assert dataset["a/u"][0].shape == (4, 9, 12)
     with pytest.raises(InputError, match="closed"):
-        dataset["v"].container.arrays["tables/level_1"].read()
+        dataset["v"].container.arrays["table_1"].read()
 
 
 def test_one_variable_is_opened_by_name(run: tuple[Arrays, Path]) -> None:
@@ -91,7 +91,7 @@ def test_one_variable_is_opened_by_name(run: tuple[Arrays, Path]) -> None:
         with opened as volume:
             np.testing.assert_allclose(volume[...], arrays["a/u"], atol=0.01)
         with pytest.raises(InputError, match="closed"):
-            volume.container.arrays["tables/level_1"].read()
+            volume.container.arrays["table_1"].read()
     with pytest.raises(InputError, match=r"several variables, v, a/u; choose one"):
         open_volume(path)
     for opening in (open_volume, fhash_codec.open):

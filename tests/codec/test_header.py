@@ -45,7 +45,7 @@ def header(quality: dict[str, Any], value_range: tuple[float, float] = (-1.0, 1.
     return {
         "value_range": list(value_range),
         "domain": {"shape": [1, 2, 3, 4]},
-        "model": {"gains": [["start", 9, 0.5], ["end", 7], 5]},
+        "model": {"gains": [["start", 9, 0.5], ["end", 7, 1.0], 5]},
         "history": {"epoch": [3]},
         "quality": quality,
     }
@@ -65,7 +65,7 @@ def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
     assert full["history"] == [{"seconds": None, "psnr": None, "epoch": 3}]
     assert full["model"]["gains"] == [
         {"what": "start", "bytes": 9, "seconds": 0.5},
-        {"what": "end", "bytes": 7},
+        {"what": "end", "bytes": 7, "seconds": 1.0},
     ]
     other = {**window, "steps": [3], "data_range": 1.9}
     brief = brief_quality(WRITER, {"per_step": [], "ssim_window": other}, 2.0, (1, 2, 3, 4))

@@ -373,7 +373,7 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch) -> Non
 
         monkeypatch.setattr(StoredArray, "read", recorded)
         volume.read(2)
-        steps = [region[0] for name, region in asked if name == "tables/level_1"]
+        steps = [region[0] for name, region in asked if name == "table_1"]
         assert steps
         assert all(step == slice(1, 2) for step in steps)
         assert len([name for name, _ in asked if name == "occupancy"]) == 1

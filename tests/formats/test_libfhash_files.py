@@ -288,7 +288,7 @@ def test_a_region_of_a_tile_with_a_head_equals_that_part_of_the_tile(tmp_path: P
     ):
         fhash_codec.encode(values, path, config)
     with fhash_codec.open(path) as volume:
-        assert volume.container.arrays["tables/level_1"].settings.head is not None
+        assert volume.container.arrays["table_1"].settings.head is not None
         wanted = [volume.read(step) for step in range(2)]
     places = [(0, 0, 0), (5, 9, 8), (13, 29, 29), (7, 15, 14)]
     for place in places:

@@ -43,7 +43,7 @@ AXES = ("time", "z", "y", "x")
 KINDS_OF_NUMBERS = (*DTYPES, "bool", "complex64")
 FEATURES = sorted(KNOWN_FEATURES)
 NODES = (
-    *("u", "v", "time", "x", "v0", "v1", "v9", "v00", "v0/", "tables", "zarr.json", "", "a.b"),
+    *("u", "v", "time", "x", "v0", "v1", "v9", "v00", "v0/", "table_1", "zarr.json", "", "a.b"),
     *("a/b", "__u", "x" * 101, "t", "c", "t/0", "mlp", "auxiliary", "V0", "v\x000", "v0\x00"),
 )
 """Names of groups and arrays: of others, and those that are not allowed."""
@@ -238,8 +238,8 @@ VARIABLES: tuple[Rule, ...] = (
 )
 """Keys that say how many variables there are, their names and order, and the root's keys."""
 SHARED = (
-    *("auxiliary/lat", "auxiliary/lon", "auxiliary/none", "tables/level_1", "x", "../u"),
-    *("auxiliary/", "", "occupancy", "v0/tables/level_1", "missing"),
+    *("auxiliary/lat", "auxiliary/lon", "auxiliary/none", "table_1", "x", "../u"),
+    *("auxiliary/", "", "occupancy", "v0/table_1", "missing"),
 )
 """Names of arrays that a variable may say to share."""
 
@@ -340,7 +340,7 @@ PART: tuple[Rule, ...] = (
     ("model.parameters", (1, 2, *LARGE[:12])),
 )
 WHOLE = (
-    *("tables/level_1", "key_frames", "missing", "step_errors", "step_figures"),
+    *("table_1", "key_frames", "missing", "step_errors", "step_figures"),
     *("auxiliary/wide", "auxiliary/other", "occupancy", "x", "whole/x"),
 )
 """Names of arrays that the whole is said to have."""
@@ -380,7 +380,7 @@ GROWN: tuple[Rule, ...] = (
             ),
         },
     ),
-    ("encoder", ({}, {"version": "9"}, {"version": "9", "seed": 10**30})),
+    ("encoder", ({}, {"version": "9"}, {"version": 9})),
     ("model.parameters", (1, *LARGE[:12])),
     ("model.gains", OTHERS),
     ("history", HISTORIES),
@@ -537,7 +537,7 @@ def _rules(
         file = Documents(parts)
         if fits is not None and not fits(file):
             raise NothingFitsError
-        tables = {name: each for name, each in file.arrays.items() if name.startswith("tables/")}
+        tables = {name: each for name, each in file.arrays.items() if name.startswith("table_")}
         every = {"header": file.header, "top": file.top, "tables": tables}
         put(chance, every if of == "every" else getattr(file, of), rules)
         return file.packed()
@@ -550,7 +550,7 @@ def _places(chance: random.Random, parts: Parts) -> Parts:
     file = Documents(parts)
     names = list(file.arrays)
     name, number = chance.choice(names), chance.randrange(len(file.headers) + 1)
-    ends = ("tables/level_1", "key_frames", "missing", "mlp/bias_1", "auxiliary/lat", "", "..")
+    ends = ("table_1", "key_frames", "missing", "mlp/bias_1", "auxiliary/lat", "", "..")
     other = chance.choice(
         (
             *(f"v{number}/{end}" for end in ends),
@@ -567,7 +567,7 @@ def _places(chance: random.Random, parts: Parts) -> Parts:
 def _grouped(chance: random.Random, parts: Parts) -> Parts:
     """Put the arrays of the only variable into a group, as those of several lie, or into none."""
     file = Documents(parts)
-    group = chance.choice(("v0", "v0", "v1", "v00", "g", "tables"))
+    group = chance.choice(("v0", "v0", "v1", "v00", "g", "table_1"))
     if "group" in file.header:
         moved = [(name.removeprefix("v0/"), data) for name, data in parts]
     else:

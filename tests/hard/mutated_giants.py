@@ -158,7 +158,7 @@ def _plain(chance: random.Random, parts: Parts) -> Parts:
         header.pop("mlp", None)
     bits = -(-prod(1 << (n - 1).bit_length() for n in shape[1:]) // 8)
     arrays: list[tuple[str, list[int], str]] = [
-        ("tables/level_1", [*shape, 1], model["tables"]),
+        ("table_1", [*shape, 1], model["tables"]),
         ("key_frames", shape[:1], "int64"),
         ("occupancy", [1, shape[0], bits], "uint8"),
         *([("corrections", shape, "float32")] if chance.random() < 0.5 else []),
@@ -176,14 +176,14 @@ def _sparse(chance: random.Random, parts: Parts) -> Parts:
     header["model"].update(embedding_size=1, hidden_layers=0, tables="float16")
     rows = chance.choice((1, 8, prod(shape)))
     arrays: list[tuple[str, list[int], str]] = [
-        ("tables/level_1", [rows, 1], "float16"),
+        ("table_1", [rows, 1], "float16"),
         ("mlp/weight_1", [1, 1], "float32"),
         ("mlp/bias_1", [1], "float32"),
         ("key_frames", [1], "int64"),
         ("occupancy", [len(header["features"]), 1, -(-prod(shape) // 8)], "uint8"),
     ]
     rebuilt = Documents(_rebuilt(file, arrays))
-    rebuilt.arrays["tables/level_1"]["attributes"] = {"counts": [rows]}
+    rebuilt.arrays["table_1"]["attributes"] = {"counts": [rows]}
     return rebuilt.packed()
 
 

@@ -634,7 +634,7 @@ def _numbers(chance: random.Random, parts: Parts) -> Parts:
         document["data_type"] = kind
         document["codecs"][0]["configuration"] = {} if kind == "uint8" else {"endian": "little"}
         return file.packed(new)
-    return _values("tables/", CORRECTIONS)(chance, parts)
+    return _values("table_", CORRECTIONS)(chance, parts)
 
 
 def _occupancy(chance: random.Random, parts: Parts) -> Parts:

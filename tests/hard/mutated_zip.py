@@ -23,7 +23,7 @@ NAMES = (
     *("../x", "a/../../x", "/etc/passwd", "..", ".", "", "a\\x", "C:x", "c:/x", "x/", "x//y"),
     *("./x", "~/x", "a b", "a\nb", "a\x00b", ".x", "x/.y", "%2e%2e/x", "CON", "x:y"),
     *("x" * 512, "x" * 513, "x" * 65535, "x/" * 250 + "y", "zarr.json/zarr.json", "c/0"),
-    *("tables/c/0", "tables/level_1/t/00", "tables/level_1/t/9223372036854775808"),
+    *("table_1/c/x", "table_1/t/00", "table_1/t/9223372036854775808"),
 )
 FIELDS = (
     *((at, "H") for at in (4, 6, 8, 10, 12, 14, 28, 30, 32, 34, 36)),
@@ -124,7 +124,7 @@ def _nested(chance: random.Random, parts: Parts) -> bytes:
     """Put nodes into nodes: an array into an array, groups hundreds deep, a hierarchy below its own
     array."""
     deep = "a/" * chance.choice((1, 60, 200)) + "a"
-    prefix = chance.choice(("missing", "tables/level_1", "tables", "tables/level_1/t", deep))
+    prefix = chance.choice(("missing", "table_1", "table_2", "table_1/t", deep))
     below = [(f"{prefix}/{name}", data) for name, data in parts if len(prefix) + len(name) < 512]
     if chance.random() < 0.5:
         path = prefix.split("/")

@@ -50,7 +50,7 @@ TABLE = {"name": "fhash.transform"}
 def header(**changes: Any) -> dict[str, Any]:
     """Return the header of a small compact container; `changes` replace its keys."""
     return {
-        "encoder": {"version": "0.1.0", "seed": 7},
+        "encoder": {"version": "0.1.0"},
         "variable": {"name": "density", "units": "kg m-3", "dtype": "float32", "attributes": {}},
         "domain": {"shape": list(SHAPE)},
         "value_range": [-1.5, 2.5],
@@ -95,9 +95,7 @@ def write(path: Path, extra: Any, **changes: Any) -> None:
     settings = TileSettings(transform=spec, step=0.1, center=0.5, low=0.0, high=400.0)
     codecs = [{**TABLE, "configuration": {"settings": settings.to_text()}}]
     with ContainerWriter(path) as writer:
-        writer.add_whole(
-            "tables/level_1", table(), chunk_shape=SHAPE, codecs=codecs, dimension_names=AXES
-        )
+        writer.add_whole("table_1", table(), chunk_shape=SHAPE, codecs=codecs, dimension_names=AXES)
         extra(writer)
         writer.commit(header(**{"required_features": ["transform"], **changes}))
 

@@ -220,7 +220,7 @@ class Own:
     def has_one_tile(self, config: EncodeConfig) -> bool:
         """Whether the file with these settings, but for published, has a single tile."""
         with open_volume(self._paths[config]) as volume:
-            table = volume.container.arrays["tables/level_1"]
+            table = volume.container.arrays["table_1"]
             return prod(table.grid) == 1
 
     def trial(self, config: EncodeConfig) -> Trial:

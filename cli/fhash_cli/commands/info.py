@@ -479,7 +479,7 @@ def _training(info: VolumeInfo) -> str:
         saved = f"; it saves about {training['saved']:.0%} of the bytes of the values"
     return (
         f"{steps}{training['epochs']} epochs{took} on {training['device']},"
-        f" seed {info['encoder']['seed']}{lowered}{saved}"
+        f" seed {info['config']['seed']}{lowered}{saved}"
     )
 
 

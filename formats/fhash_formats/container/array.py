@@ -269,7 +269,8 @@ class ArrayMetadata:
                 **codecs[0]["configuration"],
             }
             shape, dtype, chunk = self.grid, np.dtype(np.uint32), self.together
-            codecs = plain_codecs(dtype)
+            # An index without chunks names what it needs and no more.
+            codecs = plain_codecs(dtype) if self.indexed else [_LITTLE]
         values: dict[str, Any] = {
             "zarr_format": 3,
             "node_type": "array",

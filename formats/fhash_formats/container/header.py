@@ -294,6 +294,8 @@ FRINGE = "fringe"
 COUNTS = "counts"
 """Attribute of a table: number of its vertices at each time node."""
 LAYERS = "mlp/parameters"
+SCALES = "scales"
+"""Attribute of the layers in whole numbers: the scales of weight and bias of each in turn."""
 """Name of the array of all layers of a network of coded tables, in place of two of each."""
 KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE})
 """Names in `required_features` that this version understands."""
@@ -302,7 +304,7 @@ COMPACT = "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 MLP = "mlp"
 """Key of the header: the MLP of the profile compact."""
-TABLE = "tables/level_1"
+TABLE = "table_1"
 """Name of the array of the finest table."""
 BITS_ARRAY = "occupancy"
 """Name of the array of the occupancy as bits."""
@@ -444,7 +446,6 @@ def _check_source(top: Record) -> np.dtype[Any]:
     """Check `encoder` and `variable`; the number type of the source."""
     encoder, variable = top.record("encoder"), top.record("variable")
     encoder.text("version")
-    encoder.integer("seed", -(2**63), 2**64 - 1)
     encoder.number_or_null("seconds")
     encoder.number_or_null("took_seconds")
     if encoder.has("command"):

@@ -148,11 +148,11 @@ def _refuse_options(storage_options: StorageOptions, place: str) -> None:
 CACHE_BYTES = 256 << 20
 """Bytes of decoded chunks that an open container keeps."""
 SPLIT = {
-    "field": ("tables", "corrections", "occupancy", "missing"),
-    "beside": ("auxiliary",),
-    "model": ("mlp",),
+    "field": ("table_", "corrections", "occupancy", "missing"),
+    "beside": ("auxiliary/",),
+    "model": ("mlp/",),
 }
-"""First parts of the names of arrays, by what `Container.split` calls their bytes."""
+"""Beginnings of the names of arrays, by what `Container.split` calls their bytes."""
 
 
 class Split(TypedDict):
@@ -169,7 +169,7 @@ def split_bytes(total: int, arrays: Iterable[tuple[str, StoredArray]]) -> dict[s
     found = dict.fromkeys(SPLIT, 0)
     for name, array in arrays:
         for part, beginnings in SPLIT.items():
-            if name.split("/")[0] in beginnings:
+            if name.startswith(beginnings):
                 found[part] += array.nbytes_stored
                 coded = part == "field" and array.settings is not None
                 found["model"] += array.document_bytes if coded else 0

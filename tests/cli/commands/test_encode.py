@@ -35,7 +35,7 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
         assert not any(line.startswith(f"  {gain['what']}  ") for line in brief)
     assert not any("key frames" in line or "epochs" in line for line in lines)
     bare = json.loads(fhash(*words, "--json").stdout)
-    assert [set(gain) for gain in bare["gains"]] == [{"what", "bytes"}] * len(report["gains"])
+    assert bare["gains"] == []
     assert fhash(*words, "-v").exit_code == 0
 
 

@@ -29,18 +29,18 @@ def added(line: str) -> bool:
         (
             "paper-feature",
             ["between steps", "network",
-             "tables/level_1 to tables/level_", "bytes,",
+             "table_1 to table_", "bytes,",
              "mlp/weight_1 to mlp/weight_2",
              "relu", "; occupancy, bytes,"],
         ),
         ("paper-transform", ["fhash.transform", "in the tiles of coreset"]),
-        ("paper-sparse", ["; 2 at each needed vertex, float16; tables/level_1 to tables/"]),
-        ("compact-psnr", ["tables/level_1, fhash.transform,", "none: the values"]),
-        ("compact-mask", ["in the tiles of tables/level_1"]),
+        ("paper-sparse", ["; 2 at each needed vertex, float16; table_1 to table_"]),
+        ("compact-psnr", ["table_1, fhash.transform,", "none: the values"]),
+        ("compact-mask", ["in the tiles of table_1"]),
         ("compact-cubic", ["cubic (measured: 1.3 dB better than linear"]),
         (
             "compact-linear",
-            ["; whole numbers in the header", "in the tiles of tables/level_1"],
+            ["; whole numbers in the header", "in the tiles of table_1"],
         ),
     ],
 )  # fmt: skip

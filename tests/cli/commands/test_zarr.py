@@ -99,7 +99,7 @@ def test_a_plain_file_is_written_and_described(fhash: Fhash, tmp_path: Path) -> 
         }
     info = fhash("info", plain)
     assert info.exit_code == 0, info.output
-    assert "tables/level_1 to tables/level_" in info.stdout
+    assert "table_1 to table_" in info.stdout
     assert "; occupancy, bytes," in info.stdout
     assert fhash("verify", plain).exit_code == 0
 

@@ -647,9 +647,9 @@ def run_growing(tmp_path, field):
 def with_array(run_growing, path, name, values, dimension_names):
     """A copy of a file with another array."""
     with Container.open(run_growing) as container, ContainerWriter(path) as writer:
-        table = container.arrays["tables/level_1"]
+        table = container.arrays["table_1"]
         writer.add_array(
-            "tables/level_1",
+            "table_1",
             shape=table.shape,
             dtype=table.dtype,
             chunk_shape=table.chunk_shape,

@@ -123,7 +123,7 @@ def encoded(tmp_path, values: np.ndarray, **changes) -> tuple[int, set[str], np.
     config = EncodeConfig(timings=False, **{"effort": 2, **promise, **changes})
     figures = fhash_codec.encode(values, path, config, force=True)
     with fhash_codec.open(path) as volume:
-        settings = volume.container.arrays["tables/level_1"].settings
+        settings = volume.container.arrays["table_1"].settings
         used = {name for name in ("labels", "mask") if getattr(settings, name)}
         return figures["bytes"], used, volume[...]
 
@@ -230,7 +230,9 @@ def sharp(dtype: str) -> npt.NDArray[Any]:
 def test_a_file_by_prediction_keeps_the_bound(tmp_path: Path, dtype: str) -> None:
     values = sharp(dtype)
     path = tmp_path / "a.fhz"
-    report = fhash_codec.encode(values, path, fhash_codec.EncodeConfig(max_error=30.5, effort=3))
+    report = fhash_codec.encode(
+        values, path, fhash_codec.EncodeConfig(max_error=30.5, effort=3, timings=True)
+    )
     assert "prediction" in [gain["what"] for gain in report["gains"]]
     with fhash_codec.open(path) as volume:
         decoded = volume[...]
@@ -262,7 +264,7 @@ def test_a_file_has_the_plateau_as_its_centre(tmp_path, effort: int) -> None:
     path = tmp_path / "a.fhz"
     fhash_codec.encode(values, path, EncodeConfig(psnr=45.0, effort=effort, timings=False))
     with fhash_codec.open(path) as volume:
-        settings = volume.container.arrays["tables/level_1"].settings
+        settings = volume.container.arrays["table_1"].settings
     assert settings.center == float(np.float32(0.777))
 
 
@@ -281,7 +283,7 @@ def test_the_occupancy_is_exact_at_every_step(
     requested = np.stack([dilate(frame, 1) for frame in selected])
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         assert volume.info["required_features"] == ["transform"]
-        assert volume.container.arrays["tables/level_1"].masked
+        assert volume.container.arrays["table_1"].masked
         occupied = np.stack([volume.occupancy(t) for t in range(3)])
         values = volume[...]
         assert volume.verify() == len(volume.info["arrays"])
@@ -303,7 +305,9 @@ def test_more_effort_is_no_larger_and_keeps_the_promise(
 ) -> None:
     source = field((8, 16, 32, 32))
     reports = [
-        fhash_codec.encode(source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0))
+        fhash_codec.encode(
+            source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0, timings=True)
+        )
         for n in (1, 3, 5)
     ]
     assert all(figures["psnr"] >= 45 for figures in reports)

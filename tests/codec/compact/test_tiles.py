@@ -433,7 +433,7 @@ def record_decoded_tiles(
 def test_a_region_of_a_feature_reads_its_tiles_alone(feature: Feature) -> None:
     """Mask and values come from the same bytes: those of the tiles that the region touches."""
     with fhash_codec.open(feature[1]) as volume:
-        table = volume.container.arrays["tables/level_1"]
+        table = volume.container.arrays["table_1"]
         before = volume.container.bytes_read
         (z, _), (y, _), (x, _) = volume.box
         region = ((z, z + 3), (y, y + 4), (x, x + 7))
@@ -558,7 +558,7 @@ def test_a_region_of_a_level_of_detail_decodes_the_tiles_that_it_touches(
     feature: Feature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with fhash_codec.open(feature[1]) as volume:
-        table = volume.container.arrays["tables/level_1"]
+        table = volume.container.arrays["table_1"]
         indices = record_decoded_tiles(monkeypatch, table)
         (z, _), (y, _), (x, _) = volume.box
         volume.read_lod(2, 1, ((z + 4, z + 7), (y, y + 5), (x + 8, x + 9)))
@@ -617,7 +617,7 @@ def reads(model: CompactModel) -> list[Callable[[], Any]]:
 
 @pytest.mark.parametrize("way", range(5))
 def test_infinities_in_a_table_are_damage(way: int) -> None:
-    model = model_of({"tables/level_1": Table()})
+    model = model_of({"table_1": Table()})
     with pytest.raises(DamagedFileError, match="the table holds infinities"):
         reads(model)[way]()
     assert np.isnan(model.read(1, Box.of_shape((1, 3, 4)), np.ones((1, 3, 4), bool))).sum() == 1
@@ -630,7 +630,7 @@ def test_coarse_levels_of_labels_have_every_vertex_of_the_coreset(tmp_path: Path
     config = EncodeConfig(effort=1, tile="2x3x4x5", features=("isosurface:2.5",), dilation=0)
     fhash_codec.encode(values, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume.container.arrays["tables/level_1"].settings.labels
+        assert volume.container.arrays["table_1"].settings.labels
         box = volume.box.slices()
         for step, lod in product(range(4), (1, 2)):
             coarse = volume.read_lod(step, lod)
@@ -663,7 +663,7 @@ def plain_array(corrections: object, dtype: str, *, tile: int = 2) -> PlainArray
     table = np.arange(4, dtype=np.float32).reshape(1, 1, 1, 4, 1)
     added = np.asarray(corrections, np.float64).reshape(1, 1, 1, 4)
     arrays = {
-        "tables/level_1": SimpleNamespace(shape=table.shape, read=lambda region: table[region]),
+        "table_1": SimpleNamespace(shape=table.shape, read=lambda region: table[region]),
         "corrections": SimpleNamespace(read=lambda region: added[region]),
     }
     model = {"tile": [1, 1, 1, tile], "values": dtype, "levels": [[1, 1, 1, 4]]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -137,7 +138,7 @@ def test_unsuitable_budgets_and_series_are_refused(series: ArraySeries) -> None:
 def test_stages_steps_reads_and_the_file_itself(series: ArraySeries, tmp_path: Path) -> None:
     config = EncodeConfig(effort=2, psnr=45.0)
     path = tmp_path / "run.fhz"
-    figures = encode(series, path, config)
+    figures = encode(series, path, replace(config, timings=True))
     report = report_on_encode(series, figures, config, budget=100.0)
     (point,) = report.encodings
     assert (point.name, point.options) == ("run.fhz", "--psnr 45 --effort 2")

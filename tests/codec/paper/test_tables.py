@@ -40,7 +40,6 @@ from fhash_codec.paper.storage import (
     write_tables,
 )
 from fhash_codec.paper.tables import (
-    MIN_WEIGHTS,
     WEIGHT_STEPS,
     CoarseTable,
     Samples,
@@ -116,24 +115,25 @@ def worst(changed, original) -> float:
 
 @pytest.mark.parametrize("allowed", [1e-2, 1e-4, 1e-6])
 def test_the_largest_step_that_is_allowed_is_taken(allowed) -> None:
-    original = layers(32, MIN_WEIGHTS // 32)
-    quantised, settings = quantised_layers(
+    original = layers(32, 16)
+    quantised, scales, added = quantised_layers(
         original, lambda changed: worst(changed, original), allowed
     )
-    first, last = settings
-    assert first is not None
-    assert last is None  # too small to gain anything
-    assert worst(quantised, original) <= allowed
-    np.testing.assert_array_equal(quantised[1][0], original[1][0])
-    np.testing.assert_array_equal(quantised[0][1], original[0][1])
-    # Twice the step would have been too large.
-    assert first.step > 0.8 * np.sqrt(12 * allowed) / 2 or first.step >= WEIGHT_STEPS[0] / 2
+    assert scales is not None
+    assert worst(quantised, original) == added <= allowed
+    for part, scale in zip((part for layer in quantised for part in layer), scales, strict=True):
+        numbers = part.astype(np.float64) / (scale or 1.0)
+        np.testing.assert_allclose(numbers, np.rint(numbers), rtol=1e-6)
+    np.testing.assert_allclose(quantised[0][1], original[0][1], atol=4 / 65534)
+    # Twice the scale would have been too large.
+    assert scales[0] > 0.8 * np.sqrt(12 * allowed) / 2 or scales[0] >= WEIGHT_STEPS[0] / 2
 
 
-def test_layers_that_no_step_keeps_stay_as_they_are() -> None:
+def test_layers_that_no_scale_keeps_stay_as_they_are() -> None:
     original = layers(32, 32)
-    quantised, settings = quantised_layers(original, lambda _: 1.0, 0.5)
-    assert settings == [None, None]
+    quantised, scales, added = quantised_layers(original, lambda _: 1.0, 0.5)
+    assert scales is None
+    assert added == 0
     assert quantised[0][0] is original[0][0]
 
 
@@ -292,7 +292,7 @@ def test_the_last_file_is_the_nearest_that_kept_the_promise(random_model) -> Non
     assert third.kept[1].step == first.step
     refined = replace(third, writings=COMMON).following(0.01, 0.2, silent)
     changed = [
-        ours is not theirs for ours, theirs in zip(refined.tables, first.tables, strict=True)
+        ours is not theirs for ours, theirs in zip(refined.tables, third.tables, strict=True)
     ]
     assert sum(changed) == 1
     last = replace(refined, writings=WRITINGS - 1).following(0.01, 0.2, silent)
@@ -409,9 +409,9 @@ def test_other_readers_see_what_is_needed(pair) -> None:
     with Container.open(pair["coded"][1]) as container:
         json.dumps(container.header)
         size = container.header["model"]["embedding_size"]
-        names = [name for name in container.arrays if name.startswith("tables/")]
+        names = [name for name in container.arrays if name.startswith("table_")]
         assert len(names) == size * len(container.header["model"]["levels"])
-        assert container.arrays["tables/level_1/component_1"].shape == tuple(
+        assert container.arrays["table_1/component_1"].shape == tuple(
             container.header["model"]["levels"][0]
         )
 
@@ -537,7 +537,7 @@ def rewritten(path, target, mixing) -> None:
     """Write the same arrays, not coded, with other attributes of a component of level 1."""
     with Container.open(path) as container, ContainerWriter(target) as writer:
         for name, array in container.arrays.items():
-            attributes = mixing if name == "tables/level_1/component_2" else dict(array.attributes)
+            attributes = mixing if name == "table_1/component_2" else dict(array.attributes)
             writer.add_whole(name, array.read(), attributes=attributes)
         writer.commit(container.header)
 
@@ -561,7 +561,7 @@ def coded_small(tmp_path_factory):
     ids=str,
 )
 def test_a_mixing_of_other_numbers_is_refused(tmp_path, coded_small, mixing) -> None:
-    with pytest.raises(InputError, match="array tables/level_1/component_2 attribute mixing"):
+    with pytest.raises(InputError, match="array table_1/component_2 attribute mixing"):
         rewritten(coded_small, tmp_path / "a.fhz", mixing)
 
 
@@ -747,13 +747,13 @@ def copied(source: Path, target: Path, changes: dict[str, Any]) -> None:
 
 def test_counts_that_are_not_those_of_the_occupancy_are_damage(files, tmp_path) -> None:
     with Container.open(files[1]) as container:
-        table = container.arrays["tables/level_1"]
+        table = container.arrays["table_1"]
         values, attributes = table.read(), dict(table.attributes)
         bits = container.arrays["occupancy"].read()
     first, *others = attributes["counts"]
     moved = {**attributes, "counts": [first - 1, others[0] + 1, *others[1:]]}
-    copied(files[1], tmp_path / "a.fhz", {"tables/level_1": (values, moved)})
-    message = rf"a.fhz: array tables/level_1 has {first - 1} vertices at time node 0; .* {first}$"
+    copied(files[1], tmp_path / "a.fhz", {"table_1": (values, moved)})
+    message = rf"a.fhz: array table_1 has {first - 1} vertices at time node 0; .* {first}$"
     with (
         fhash_codec.open(tmp_path / "a.fhz") as volume,
         pytest.raises(DamagedFileError, match=message),
@@ -770,7 +770,7 @@ def test_counts_that_are_not_those_of_the_occupancy_are_damage(files, tmp_path) 
 
 def test_a_table_of_other_rows_is_refused(files, tmp_path) -> None:
     with Container.open(files[1]) as container:
-        table = container.arrays["tables/level_2"]
+        table = container.arrays["table_2"]
         values, attributes = table.read(), dict(table.attributes)
-    with pytest.raises(InputError, match=r"array tables/level_2 is .* asks for"):
-        copied(files[1], tmp_path / "a.fhz", {"tables/level_2": (values[1:], attributes)})
+    with pytest.raises(InputError, match=r"array table_2 is .* asks for"):
+        copied(files[1], tmp_path / "a.fhz", {"table_2": (values[1:], attributes)})

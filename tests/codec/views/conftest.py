@@ -90,7 +90,7 @@ def apart(monkeypatch: pytest.MonkeyPatch) -> None:
 def damaged(whole: Path, tmp_path: Path) -> Path:
     """A copy of `whole` with one bit of its first tile flipped; the metadata are sound."""
     with fhash_codec.open(whole) as volume:
-        offset, _ = volume.container.arrays["tables/level_1"].place((0, 0, 0, 0))
+        offset, _ = volume.container.arrays["table_1"].place((0, 0, 0, 0))
     data = bytearray(whole.read_bytes())
     data[offset + 8] ^= 1
     path = tmp_path / "damaged.fhz"

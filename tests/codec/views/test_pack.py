@@ -420,7 +420,7 @@ def test_what_was_packed_is_unpacked_to_the_same_chunks(
     fhash_codec.pack(store, run)
     check_unpack(run)
     with fhash_codec.open(run) as volume:
-        assert volume.container.arrays["tables/level_1"].axes is not None
+        assert volume.container.arrays["table_1"].axes is not None
 
 
 def test_fill_values_come_back(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ Parts = list[tuple[str, bytes]]
 def make_header() -> dict[str, Any]:
     """A header whose arrays are small and of several chunks."""
     return {
-        "encoder": {"version": "0.1.0", "seed": 7},
+        "encoder": {"version": "0.1.0"},
         "variable": {
             "name": "density",
             "units": "kg m-3",
@@ -81,9 +81,9 @@ def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
         "key_frames": np.linspace(0, shape[0] - 1, key_frames).astype(np.int64)
     }
     for number, level in enumerate(model["levels"], start=1):
-        arrays[f"tables/level_{number}"] = rng.standard_normal(
-            (*level, model["embedding_size"])
-        ).astype(model["tables"])
+        arrays[f"table_{number}"] = rng.standard_normal((*level, model["embedding_size"])).astype(
+            model["tables"]
+        )
     inputs = len(model["levels"]) * model["embedding_size"]
     widths = [inputs, *[model["width"]] * model["hidden_layers"], 1]
     for number, (inputs, outputs) in enumerate(pairwise(widths), start=1):
@@ -129,8 +129,8 @@ def write(
     """A container of whole arrays; the finest table in 2 x 2 x 2 chunks, some of them at an end."""
     with ContainerWriter(path, **options) as writer:
         for name, array in arrays.items():
-            table = name == "tables/level_1" and array.shape[1:] == (3, 4, 6, 2)
-            quantised = name.startswith("tables/") and array.dtype == np.uint8
+            table = name == "table_1" and array.shape[1:] == (3, 4, 6, 2)
+            quantised = name.startswith("table_") and array.dtype == np.uint8
             usual = {"offset": 0.5, "scale": 0.25} if quantised else None
             writer.add_whole(
                 name,

@@ -27,7 +27,7 @@ KILLED = 77
 
 def growing_array(frame: tuple[int, int, int] = FRAME) -> GrowingArray:
     return GrowingArray(
-        name="tables/level_1",
+        name="table_1",
         frame=frame,
         dtype=np.dtype(np.float32),
         tile=TILE,
@@ -55,7 +55,7 @@ def streams_of(values: np.ndarray) -> list[bytes]:
 def growing_header(steps: int, frame: tuple[int, int, int] = FRAME) -> dict[str, Any]:
     return {
         "required_features": ["transform"],
-        "encoder": {"version": "0", "seed": 0},
+        "encoder": {"version": "0"},
         "variable": {"name": "u", "units": "", "dtype": "float32", "attributes": {}},
         "domain": {"shape": [steps, *frame]},
         "value_range": [-9.0, 9.0],
@@ -95,7 +95,7 @@ def check_layers(path: Path, frame: tuple[int, int, int] = FRAME) -> int:
     """Compare every layer of a file with what was written; their number."""
     with Container.open(path) as container:
         container.verify()
-        read = container.arrays["tables/level_1"].read()
+        read = container.arrays["table_1"].read()
     for first in range(0, len(read), TILE[0]):
         z, y, x = frame
         expected = layer_values(first // TILE[0], frame)[:, :z, :y, :x]

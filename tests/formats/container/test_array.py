@@ -305,8 +305,8 @@ MEMBERS = {
     "tiles of other axes": (lambda p: p.update({f"{NAME}/t/0/0": b"x"}), "belongs to no array"),
     "tiles of another name": (lambda p: p.update({f"{NAME}/t/00": b"x"}), "belongs to no array"),
     "tiles of numbers": (
-        lambda p: p.update({"tables/level_1/t/0": b"x"}),
-        "member tables/level_1/t/0 belongs to no array",
+        lambda p: p.update({"table_1/t/0": b"x"}),
+        "member table_1/t/0 belongs to no array",
     ),
     # As a number of 64 bits without a sign this is 0 beyond 2^63.
     "tiles of a giant number": (

@@ -76,8 +76,8 @@ PLACES = {
         "has 0 chunks",
     ),
     "table missing": (
-        lambda p: [part for part in p if not part[0].startswith("tables/level_2")],
-        "tables/level_2 is missing",
+        lambda p: [part for part in p if not part[0].startswith("table_2")],
+        "table_2 is missing",
     ),
 }
 
@@ -182,7 +182,7 @@ ROOTS = {
         "variable 'u': .*levels",
     ),
     "shares that are a list": (f"{FIRST}.shares", ["auxiliary/lat"], "an object"),
-    "a shared table": (f"{FIRST}.shares", {"tables/level_1": 2}, "is missing, or is there"),
+    "a shared table": (f"{FIRST}.shares", {"table_1": 2}, "is missing, or is there"),
     "shares of no variable": (f"{FIRST}.shares", {"auxiliary/a": 3}, "number of a variable"),
     "shares of no number": (f"{FIRST}.shares", {"auxiliary/a": "w"}, "number of a variable"),
     "shares that are not there": (
@@ -192,7 +192,7 @@ ROOTS = {
     ),
     "shares of another table": (
         f"{FIRST}.shares",
-        {"auxiliary/a": [2, "tables/level_1"]},
+        {"auxiliary/a": [2, "table_1"]},
         "the number",
     ),
     "shares of three": (f"{FIRST}.shares", {"auxiliary/a": [2, "auxiliary/a", 1]}, "the number"),
@@ -242,11 +242,11 @@ def test_an_mlp_stands_once(tmp_path, samples) -> None:
     path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts())
     whole = table_parts().settings.to_text()
     place = "attributes.tiles.settings"
-    data = edited(path, samples, "tables/level_1/zarr.json", lambda v: put_at(v, place, whole))
+    data = edited(path, samples, "table_1/zarr.json", lambda v: put_at(v, place, whole))
     refused(path, data, "they have a head of their own")
 
 
-@pytest.mark.parametrize("name", ["a", "v3", "v00/a", "v0a", "u/tables/level_1"])
+@pytest.mark.parametrize("name", ["a", "v3", "v00/a", "v0a", "u/table_1"])
 def test_arrays_that_belong_to_no_variable(tmp_path, samples, name) -> None:
     """They are checked as all are, but no variable has them."""
     path = write_several(tmp_path / "a.fhz", samples, paper=False)
@@ -268,7 +268,7 @@ def test_a_missing_chunk_of_any_variable_is_refused(tmp_path, samples) -> None:
     path = write_several(tmp_path / "a.fhz", samples)
     parts = samples.unpack(path.read_bytes())
     for missing in (
-        *("v2/tables/level_1/t/0", "v2/tables/level_1/c/0/0/0/0"),
+        *("v2/table_1/t/0", "v2/table_1/c/0/0/0/0"),
         *("v0/auxiliary/area/c/0/0", "v3/key_frames/c/0"),
     ):
         assert missing in dict(parts)

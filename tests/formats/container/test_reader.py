@@ -28,8 +28,8 @@ from fhash_formats.native import crc32c
 
 ARRAYS = {
     "key_frames": lambda a: a[:1],
-    "tables/level_1": lambda a: a[..., :1],
-    "tables/level_2": lambda a: a.astype("float32"),
+    "table_1": lambda a: a[..., :1],
+    "table_2": lambda a: a.astype("float32"),
     "mlp/weight_1": lambda a: np.ascontiguousarray(a.T),
     "mlp/bias_1": lambda a: a[:, None],
     "mlp/weight_2": lambda a: a.astype("float64"),
@@ -67,7 +67,7 @@ def test_quantised_tables_need_offset_and_scale(tmp_path, samples, attributes) -
     header = samples.header()
     header["model"]["tables"] = "uint8"
     arrays = samples.arrays(header)
-    with pytest.raises(InputError, match=r"array tables/level_1 attribute (offset|scale)"):
+    with pytest.raises(InputError, match=r"array table_1 attribute (offset|scale)"):
         samples.write(tmp_path / "a.fhz", header, arrays, dict.fromkeys(arrays, attributes))
 
 
@@ -77,7 +77,7 @@ def test_quantised_tables_need_offset_and_scale(tmp_path, samples, attributes) -
         ({"model.tables": "transform"}, "required_features"),
         (
             {"model.tables": "transform", "required_features": ["transform"]},
-            "array tables/level_1/component_1 is missing",
+            "array table_1/component_1 is missing",
         ),
         ({"model.tables_loss_db": "0.1"}, "tables_loss_db"),
         ({"required_features": ["residual"]}, "does not know: upgrade, or encode"),
@@ -101,21 +101,23 @@ def test_components_need_their_mixing(tmp_path, samples, mixing) -> None:
     arrays = samples.arrays(header)
     header["model"]["tables"], header["required_features"] = "transform", ["transform"]
     components = {
-        f"tables/level_{number}/component_{part}": np.ones(level, np.float32)
+        f"table_{number}/component_{part}": np.ones(level, np.float32)
         for number, level in enumerate(header["model"]["levels"], start=1)
         for part in (1, 2)
     }
-    arrays = components | {n: array for n, array in arrays.items() if not n.startswith("tables/")}
+    layers = [array.ravel() for name, array in arrays.items() if name.startswith("mlp/")]
+    rest = {n: a for n, a in arrays.items() if not n.startswith(("table_", "mlp/"))}
+    arrays = {**components, **rest, "mlp/parameters": np.concatenate(layers)}
     good = {name: {"mixing": [0.5, -1e300]} for name in components}
     samples.write(tmp_path / "a.fhz", header, arrays, good)
-    bad = good | {"tables/level_2/component_1": {} if mixing is None else {"mixing": mixing}}
-    with pytest.raises(InputError, match="array tables/level_2/component_1 attribute mixing"):
+    bad = good | {"table_2/component_1": {} if mixing is None else {"mixing": mixing}}
+    with pytest.raises(InputError, match="array table_2/component_1 attribute mixing"):
         samples.write(tmp_path / "b.fhz", header, arrays, bad)
 
 
 def test_arrays_of_other_names_are_ignored(tmp_path, samples) -> None:
     header = samples.header()
-    others = {"tables/novelty": np.zeros(3, np.uint8), "t": np.zeros(3), "c": np.zeros(3)}
+    others = {"table_0": np.zeros(3, np.uint8), "t": np.zeros(3), "c": np.zeros(3)}
     arrays = samples.arrays(header) | others
     samples.write(tmp_path / "a.fhz", header, arrays)
     with Container.open(tmp_path / "a.fhz") as container:
@@ -139,7 +141,7 @@ BOX = (3, 4, 6)
 
 
 def compact_arrays(key_frames=4, dtype="float32"):
-    return {"tables/level_1": np.ones((key_frames, *BOX), dtype=dtype)}
+    return {"table_1": np.ones((key_frames, *BOX), dtype=dtype)}
 
 
 OPTIONAL = {
@@ -168,7 +170,7 @@ def test_arrays_that_it_may_have(tmp_path, samples, case) -> None:
 def test_table_fits_the_header(tmp_path, samples) -> None:
     header = samples.compact_header()
     for wrong in ({}, compact_arrays(3), compact_arrays(dtype="float64")):
-        with pytest.raises(InputError, match="tables/level_1"):
+        with pytest.raises(InputError, match="table_1"):
             samples.write(tmp_path / "a.fhz", header, wrong)
 
 
@@ -202,7 +204,7 @@ def test_verify_reports_every_member(sample, samples) -> None:
 
 def test_chunks_whose_values_are_known_are_checked_and_not_decoded(sample) -> None:
     with Container.open(sample) as container:
-        name = "tables/level_1"
+        name = "table_1"
         first = (0,) * len(container.arrays[name].grid)
         values = np.full_like(container.arrays[name].decode_chunk(first), 7)
     with Container.open(sample) as container:
@@ -510,17 +512,17 @@ def test_each_variable_is_what_a_file_of_its_own_would_be(tmp_path, samples) -> 
             alone = write_table(tmp_path / "a.fhz", samples.compact_header(), parts)
             with Container.open(alone) as one:
                 assert (file.variable, one.variable, dict(one.variables)) == (None, None, {})
-                own, table = file.variables[name], one.arrays["tables/level_1"]
+                own, table = file.variables[name], one.arrays["table_1"]
                 assert own.variable == name
                 assert own.header["variable"] == one.header["variable"]
-                read = own.arrays["tables/level_1"]
+                read = own.arrays["table_1"]
                 np.testing.assert_array_equal(read.read(), table.read())
                 np.testing.assert_array_equal(read.read_mask(), table.read_mask())
                 for lod in (0, 1):
                     np.testing.assert_array_equal(
                         read.decode_chunk((0, 0, 0, 1), lod), table.decode_chunk((0, 0, 0, 1), lod)
                     )
-        u, w = (file.variables[name].arrays["tables/level_1"].read() for name in "uw")
+        u, w = (file.variables[name].arrays["table_1"].read() for name in "uw")
         assert not np.array_equal(u, w)
         paper = file.variables["paper"]
         assert {name: array.read().tobytes() for name, array in paper.arrays.items()} == {
@@ -533,8 +535,8 @@ def test_each_variable_is_what_a_file_of_its_own_would_be(tmp_path, samples) -> 
 def test_coordinates_are_there_once_and_others_have_their_own(tmp_path, samples) -> None:
     with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
         assert list(file.arrays) == [
-            *("v0/auxiliary/area", "v0/tables/level_1", "v1/tables/level_1"),
-            *("v2/auxiliary/area", "v2/tables/level_1"),
+            *("v0/auxiliary/area", "v0/table_1", "v1/table_1"),
+            *("v2/auxiliary/area", "v2/table_1"),
         ]
         headers = [each["coordinates"] for each in file.header["variables"]]
         assert headers[1] == {"time": 0, "z": 0, "y": 0, "x": 0}
@@ -576,14 +578,14 @@ def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
 def test_variables_do_not_share_cached_chunks(tmp_path, samples) -> None:
     with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
         region = tuple(slice(0, 2) for _ in range(4))
-        values = {n: v.arrays["tables/level_1"].read(region) for n, v in file.variables.items()}
-        again = {n: v.arrays["tables/level_1"].read(region) for n, v in file.variables.items()}
+        values = {n: v.arrays["table_1"].read(region) for n, v in file.variables.items()}
+        again = {n: v.arrays["table_1"].read(region) for n, v in file.variables.items()}
         for name in values:
             np.testing.assert_array_equal(values[name], again[name])
         assert not np.array_equal(values["u"], values["w"])
         assert len({v.digest for v in (file, *file.variables.values())}) == 4
         file.variables["u"].close()
-        file.variables["w"].arrays["tables/level_1"].read()
+        file.variables["w"].arrays["table_1"].read()
         file.variables["u"].closing_file().close()
         with pytest.raises(InputError, match="closed"):
             file.variables["w"].arrays["auxiliary/area"].read()
@@ -666,7 +668,7 @@ def test_the_bytes_of_a_file_are_split_without_a_rest(tmp_path, samples) -> None
             assert sum(each[name].values()) == variable.size
         for part in ("field", "beside", "model"):
             assert sum(found[part] for found in each.values()) == parts[part]
-        assert each["u"]["field"] == file.variables["u"].arrays["tables/level_1"].nbytes_stored
+        assert each["u"]["field"] == file.variables["u"].arrays["table_1"].nbytes_stored
         assert min(each["u"]["model"], each["w"]["model"]) > 0
         weights = sum(
             array.nbytes_stored

@@ -128,7 +128,7 @@ def test_region_touches_only_its_chunks_and_once(tmp_path, samples) -> None:
 
 def test_result_is_the_callers_own(sample) -> None:
     with Container.open(sample) as container:
-        table = container.arrays["tables/level_2"]
+        table = container.arrays["table_2"]
         everything = tuple(slice(0, n) for n in table.shape)
         table.read(everything)[:] = 0
         assert np.all(table.read(everything) != 0)
@@ -228,15 +228,15 @@ def test_a_small_part_of_a_tile_has_the_bits_of_the_whole(tmp_path, samples) -> 
 
 @pytest.mark.parametrize("cache_bytes", [0, 200, 1 << 20])
 def test_a_cache_of_any_size_changes_no_value(sample, samples, cache_bytes) -> None:
-    right = samples.arrays(samples.header())["tables/level_1"]
+    right = samples.arrays(samples.header())["table_1"]
     with Container.open(sample, cache_bytes=cache_bytes) as container:
-        table = container.arrays["tables/level_1"]
+        table = container.arrays["table_1"]
         for _ in range(2):
             read = table.read(tuple(slice(0, n) for n in table.shape))
             np.testing.assert_array_equal(read, right)
 
 
-COUNTED = {"tables/level_1": [5, 7], "tables/level_2": [3, 0]}
+COUNTED = {"table_1": [5, 7], "table_2": [3, 0]}
 
 
 @pytest.fixture
@@ -270,7 +270,7 @@ def write(
 def test_a_file_of_sparse_tables_is_read(tmp_path, samples, header) -> None:
     write(tmp_path / "a.fhz", header, samples.arrays(header))
     with Container.open(tmp_path / "a.fhz") as container:
-        assert container.arrays["tables/level_1"].shape == (12, 2)
+        assert container.arrays["table_1"].shape == (12, 2)
         container.verify()
 
 
@@ -304,12 +304,12 @@ def test_the_feature_must_be_required(tmp_path, samples, header) -> None:
     ids=str,
 )
 def test_counts_that_do_not_fit_the_level_are_refused(tmp_path, samples, header, counts) -> None:
-    with pytest.raises(InputError, match="level_1 attribute counts is"):
+    with pytest.raises(InputError, match="table_1 attribute counts is"):
         write(
             tmp_path / "a.fhz",
             header,
             samples.arrays(header),
-            COUNTED | {"tables/level_1": counts},
+            COUNTED | {"table_1": counts},
         )
 
 
@@ -319,18 +319,18 @@ def test_counts_that_do_not_fit_the_level_are_refused(tmp_path, samples, header,
     ids=lambda table: f"{table.dtype} {table.shape}",
 )
 def test_a_table_that_does_not_fit_its_counts_is_refused(tmp_path, samples, header, table) -> None:
-    with pytest.raises(InputError, match=r"array tables/level_1 is .* asks for float16 \(12, 2\)"):
-        write(tmp_path / "a.fhz", header, samples.arrays(header), **{"tables/level_1": table})
+    with pytest.raises(InputError, match=r"array table_1 is .* asks for float16 \(12, 2\)"):
+        write(tmp_path / "a.fhz", header, samples.arrays(header), **{"table_1": table})
 
 
 def test_dense_tables_in_a_sparse_file_are_refused(tmp_path, samples, header) -> None:
-    with pytest.raises(InputError, match="level_1 attribute counts is missing"):
+    with pytest.raises(InputError, match="table_1 attribute counts is missing"):
         samples.write(tmp_path / "a.fhz", header, samples.arrays(header))
 
 
 def test_a_missing_table_is_named(tmp_path, samples, header) -> None:
-    counted = {name: counts for name, counts in COUNTED.items() if name != "tables/level_2"}
-    with pytest.raises(InputError, match="array tables/level_2 is missing"):
+    counted = {name: counts for name, counts in COUNTED.items() if name != "table_2"}
+    with pytest.raises(InputError, match="array table_2 is missing"):
         write(tmp_path / "a.fhz", header, samples.arrays(header), counted)
 
 
@@ -442,7 +442,7 @@ def test_coded_tiles_come_in_any_order_within_a_member(tmp_path, samples) -> Non
         with pytest.raises(InputError, match="level of detail -1"):
             array.decode_chunk((0, 0), -1)
         with pytest.raises(InputError, match="no levels of detail"):
-            container.arrays["tables/level_1"].decode_chunk((0, 0, 0, 0), 1)
+            container.arrays["table_1"].decode_chunk((0, 0, 0, 0), 1)
 
 
 @pytest.mark.parametrize("index", [(4, 0), (0, 2), (-1, 0), (0,)])

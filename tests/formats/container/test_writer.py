@@ -213,13 +213,13 @@ def test_same_content_gives_same_bytes(tmp_path, samples) -> None:
 def test_chunks_of_one_array_may_come_from_a_generator(tmp_path, samples) -> None:
     header = samples.header()
     arrays = samples.arrays(header)
-    table = arrays.pop("tables/level_1")
+    table = arrays.pop("table_1")
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         for name, array in arrays.items():
             writer.add_whole(name, array)
         chunks = (table[t : t + 1, z : z + 2] for t in range(2) for z in (0, 2))
         writer.add_array(
-            "tables/level_1",
+            "table_1",
             shape=table.shape,
             dtype=">f2",
             chunk_shape=(1, 2, 4, 6, 2),
@@ -227,8 +227,8 @@ def test_chunks_of_one_array_may_come_from_a_generator(tmp_path, samples) -> Non
         )
         writer.commit(header)
     with Container.open(tmp_path / "a.fhz") as container:
-        np.testing.assert_array_equal(container.arrays["tables/level_1"].read(), table)
-        assert container.arrays["tables/level_1"].dtype == np.dtype("float16")
+        np.testing.assert_array_equal(container.arrays["table_1"].read(), table)
+        assert container.arrays["table_1"].dtype == np.dtype("float16")
 
 
 def test_no_more_than_one_member_is_held(tmp_path, samples) -> None:
@@ -299,7 +299,7 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         tile = np.zeros((21, 32, 32, 64), dtype=np.float32)
         writer.add_array(
-            "tables/level_1",
+            "table_1",
             shape=(steps, 64, 64, 128),
             dtype=tile.dtype,
             chunk_shape=tile.shape,
@@ -309,7 +309,7 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
         )
         size = writer.commit(header)
     with Container.open(tmp_path / "a.fhz") as container:
-        table = container.arrays["tables/level_1"].nbytes_stored
+        table = container.arrays["table_1"].nbytes_stored
         assert container.overhead() == size - table
     assert size - table <= 4096
 
@@ -415,7 +415,7 @@ def test_the_last_layer_may_be_short(tmp_path) -> None:
         add_layer(growing, 0)
         add_layer(growing, 1, steps=3)
     with Container.open(path) as container:
-        assert container.arrays["tables/level_1"].shape == (3, *FRAME)
+        assert container.arrays["table_1"].shape == (3, *FRAME)
     assert check_layers(path) == 2
 
 
@@ -441,10 +441,10 @@ def test_a_reader_goes_on_with_the_state_that_it_opened(tmp_path) -> None:
         with Container.open(path) as early:
             for number in range(1, 4):
                 add_layer(growing, number)
-            assert early.arrays["tables/level_1"].shape[0] == 2
-            first = early.arrays["tables/level_1"].read()
+            assert early.arrays["table_1"].shape[0] == 2
+            first = early.arrays["table_1"].read()
         with Container.open(path) as late:
-            np.testing.assert_array_equal(late.arrays["tables/level_1"].read()[:2], first)
+            np.testing.assert_array_equal(late.arrays["table_1"].read()[:2], first)
 
 
 def test_an_end_that_later_ones_took_the_place_of_is_that_of_its_time(tmp_path) -> None:
@@ -462,7 +462,7 @@ def test_an_end_that_later_ones_took_the_place_of_is_that_of_its_time(tmp_path) 
             if number == 0:
                 early = Container.open(path)
     np.testing.assert_array_equal(early.coordinate("time").values, np.arange(2.0) ** 2)
-    assert early.arrays["tables/level_1"].read().shape == (2, *FRAME)
+    assert early.arrays["table_1"].read().shape == (2, *FRAME)
     early.close()
     with Container.open(path) as late:
         np.testing.assert_array_equal(late.coordinate("time").values, np.arange(6.0) ** 2)
@@ -618,7 +618,7 @@ def test_a_table_beyond_a_member_is_cut_into_several(tmp_path, samples, monkeypa
     paths = [written(f"{number}.fhz", each) for number, each in enumerate((parts, known))]
     assert paths[0].read_bytes() == paths[1].read_bytes()
     with Container.open(whole) as container, Container.open(paths[0]) as cut:
-        table, other = container.arrays["tables/level_1"], cut.arrays["tables/level_1"]
+        table, other = container.arrays["table_1"], cut.arrays["table_1"]
         assert prod(other.together) < prod(table.together)
         np.testing.assert_array_equal(table.read(), other.read())
         for index in np.ndindex(table.grid):

@@ -64,7 +64,7 @@ def write_tiled(
         order = tiles_of(tiled(values, tile, together))
         chunks = (chunk_of(values, index, tile) for index in order)
     with ContainerWriter(path, force=True) as writer:
-        writer.add_whole("tables/level_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
+        writer.add_whole("table_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
         settings = {
             "shape": values.shape,
             "dtype": values.dtype,

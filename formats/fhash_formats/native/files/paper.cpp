@@ -37,7 +37,7 @@ bool read_sizes(const Variable& variable, int64_t& size, int64_t& layers, int64_
            model.integer("width", 1, 65536, width, error);
 }
 
-std::string table_name(size_t level) { return "tables/level_" + std::to_string(level + 1); }
+std::string table_name(size_t level) { return "table_" + std::to_string(level + 1); }
 
 std::string component_name(size_t level, int64_t component) {
     return table_name(level) + "/component_" + std::to_string(component + 1);
@@ -124,6 +124,7 @@ bool read_numbers(fhash_file& file, const Array& array, const Region& region,
         const uint8_t* const at = bytes.data() + i * fhash_type_size(array.type);
         if (array.type == FHASH_FLOAT32) numbers[i] = little<float>(at);
         else if (array.type == FHASH_FLOAT16) numbers[i] = from_half(little<uint16_t>(at));
+        else if (array.type == FHASH_INT16) numbers[i] = float(little<int16_t>(at));
         else numbers[i] = float(bytes[i]) * factor + start;
     }
     return true;
@@ -333,8 +334,12 @@ bool read_layers(const Model& model, std::vector<Layer>& layers, fhash_error& er
                 all.last[0] = start += count;
             }
             if (!read_numbers(model.file, *array, all, numbers, error)) return false;
-            for (const float each : numbers)
-                if (!std::isfinite(each))
+            const Json scales = yyjson_obj_get(array->attributes, "scales");
+            const bool whole = together && array->type == FHASH_INT16;
+            const float scale =
+                whole ? float(yyjson_get_num(yyjson_arr_get(scales, 2 * i + size_t(part)))) : 1.0f;
+            for (float& each : numbers)
+                if (!std::isfinite(each *= scale))
                     return fail(error, FHASH_ERROR_DAMAGED,
                                 "a layer of the network has numbers that are not finite");
         }
@@ -454,11 +459,22 @@ bool check_network(const Variable& variable, fhash_error& error) {
     for (size_t level = 0; level < variable.levels.size(); level++)
         if (!check_table(variable, level, size, error)) return false;
     const auto shapes = layer_shapes(variable, size, layers, width);
-    if (kind == "transform" && variable.find("mlp/parameters")) {
+    if (kind == "transform") {
         int64_t count = 0;
         for (const auto& shape : shapes) count += shape.first * (shape.second + 1);
-        if (!check_array(variable, "mlp/parameters", {count}, {FHASH_FLOAT32}, true, error))
+        if (!check_array(variable, "mlp/parameters", {count}, {FHASH_FLOAT32, FHASH_INT16}, true,
+                         error))
             return false;
+        const Array& numbers = *variable.find("mlp/parameters");
+        const Json scales = yyjson_obj_get(numbers.attributes, "scales");
+        bool good = numbers.type != FHASH_INT16 || yyjson_arr_size(scales) == 2 * shapes.size();
+        yyjson_arr_iter iter = yyjson_arr_iter_with(yyjson_is_arr(scales) ? scales : nullptr);
+        while (Json each = yyjson_arr_iter_next(&iter))
+            good = good && yyjson_is_num(each) && std::isfinite(float(yyjson_get_num(each)));
+        if (!good)
+            return fail(error, FHASH_ERROR_DAMAGED,
+                        "array mlp/parameters attribute scales is no list of a number for each "
+                        "weight and bias");
     } else {
         for (size_t i = 0; i < shapes.size(); i++) {
             const std::string number = std::to_string(i + 1);

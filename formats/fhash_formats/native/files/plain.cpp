@@ -12,7 +12,7 @@ namespace fhash {
 
 namespace {
 
-std::string lattice_table(size_t level) { return "tables/level_" + std::to_string(level); }
+std::string lattice_table(size_t level) { return "table_" + std::to_string(level); }
 
 // Adds corrections to predicted values of one type.
 template <class T> bool correct(T* values, const Buffer& corrections, int32_t type) {
@@ -37,7 +37,7 @@ template <class T> bool correct(T* values, const Buffer& corrections, int32_t ty
 // The values of a region (t, z, y, x), which is a tile where there is a head.
 bool read_part(fhash_file& file, const Variable& variable, const Head* head, const Region& region,
                Buffer& values, fhash_error& error) {
-    const Array& table = *variable.find("tables/level_1");
+    const Array& table = *variable.find("table_1");
     Region part = region;
     part.last[4] = 1;
     Buffer numbers;

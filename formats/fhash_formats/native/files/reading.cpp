@@ -247,7 +247,7 @@ bool read_compact(const Call& call, int64_t key, Frame& frame, fhash_error& erro
     const bool read =
         variable.plain
             ? read_plain(call.file, variable, key, call.common, frame, error)
-            : read_table(call.file, *variable.find("tables/level_1"), key, call.common, frame,
+            : read_table(call.file, *variable.find("table_1"), key, call.common, frame,
                          error);
     return read && check_finite(frame, error);
 }

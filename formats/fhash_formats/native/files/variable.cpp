@@ -305,7 +305,7 @@ bool check_arrays(const Variable& variable, fhash_error& error) {
         return false;
     const std::vector<int64_t> lengths(level.begin(), level.end());
     if (variable.compact && !variable.plain) {
-        if (!check_array(variable, "tables/level_1", lengths, {variable.values}, true, error) ||
+        if (!check_array(variable, "table_1", lengths, {variable.values}, true, error) ||
             !check_blocks(variable, error))
             return false;
     } else {
@@ -341,7 +341,7 @@ bool read_header(Variable& variable, fhash_error& error) {
            read_model(variable, error) && read_mlp(variable, error);
 }
 
-const char* const TABLE = "tables/level_1";
+const char* const TABLE = "table_1";
 
 // Reads the beginning of the paths of a variable's arrays; of one of several this is a group.
 bool read_group(std::vector<Variable>& all, size_t number, fhash_error& error) {

@@ -235,7 +235,7 @@ int64_t tile_length(const Variable& variable, int axis) {
     int64_t lengths[4] = {};
     fhash_error ignored;
     if (variable.plain) variable.model.integers("tile", 4, 1, MAX_LENGTH, lengths, ignored);
-    else if (variable.compact) return variable.find("tables/level_1")->inner[size_t(axis)];
+    else if (variable.compact) return variable.find("table_1")->inner[size_t(axis)];
     return lengths[axis];
 }
 

@@ -102,26 +102,20 @@ bool read_places(Json list, Array& array, fhash_error& error) {
     return good || damaged(error, "attribute tiles: axes are not allowed");
 }
 
-bool read_plain(Json codecs, const Array& array, fhash_error& error) {
+// chunkless: the index of tiles that are members of their own, which has no chunks to code.
+bool read_plain(Json codecs, const Array& array, bool chunkless, fhash_error& error) {
     const char* const little = R"({"name":"bytes","configuration":{"endian":"little"}})";
     const Json first = yyjson_arr_get(codecs, 0), zstd = yyjson_arr_get(codecs, 1);
     const Json settings = yyjson_obj_get(zstd, "configuration");
-    bool good = yyjson_arr_size(codecs) == 3 && is(yyjson_obj_get(zstd, "name"), "zstd") &&
+    const bool bare = yyjson_arr_size(codecs) == 1;
+    bool good = bare || (yyjson_arr_size(codecs) == 3 && is(yyjson_obj_get(zstd, "name"), "zstd") &&
                 yyjson_obj_size(zstd) == 2 && yyjson_obj_size(settings) == 2 &&
                 yyjson_is_int(yyjson_obj_get(settings, "level")) &&
                 yyjson_is_false(yyjson_obj_get(settings, "checksum")) &&
-                json_is(yyjson_arr_get(codecs, 2), R"({"name":"crc32c"})");
+                json_is(yyjson_arr_get(codecs, 2), R"({"name":"crc32c"})"));
     const bool one = fhash_type_size(array.type) == 1 && json_is(first, R"({"name":"bytes"})");
-    good = good && (one || json_is(first, little));
+    good = good && bare == chunkless && (one || json_is(first, little));
     return good || unsupported(error, "codecs other than bytes, zstd, crc32c");
-}
-
-// The codecs of the chunks of an array that is no table of tiles.
-bool read_codecs(Json codecs, Array& array, fhash_error& error) {
-    const size_t size = fhash_type_size(array.type);
-    if (!product_within(array.inner, array.axes, MAX_CHUNK_BYTES / size))
-        return damaged(error, "chunks of more than 2^30 bytes");
-    return read_plain(codecs, array, error);
 }
 
 // What `tiles` says of them; the array has been read as their index.
@@ -211,7 +205,11 @@ bool read_array(Json values, Array& array, fhash_error& error) {
     array.attributes = yyjson_obj_get(values, "attributes");
     array.inner = array.chunk;
     const Json tiles = yyjson_obj_get(array.attributes, "tiles");
-    return read_codecs(codecs, array, error) && (!tiles || read_tiles(tiles, array, error));
+    if (!product_within(array.inner, array.axes, MAX_CHUNK_BYTES / fhash_type_size(array.type)))
+        return damaged(error, "chunks of more than 2^30 bytes");
+    const bool chunkless = tiles && product_within(array.chunk, array.axes, 1);
+    return read_plain(codecs, array, chunkless, error) &&
+           (!tiles || read_tiles(tiles, array, error));
 }
 
 // Splits the name of a chunk's member, "path/c/0/1", or of that of tiles, "path/t/0", into the path
