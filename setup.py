@@ -209,8 +209,11 @@ class BuildNative(build_ext):
         """Write the bytes of each object to build/objects.json: a test holds them to a limit, since
         the time of a compiler is that of the code that it makes."""
         sizes = {Path(path).name: os.path.getsize(path) for path in self.objects}
-        Path("build").mkdir(exist_ok=True)
-        Path("build/objects.json").write_text(json.dumps(sizes, indent=1), "utf-8")
+        kept = Path("build/objects.json")
+        if not sizes and kept.exists():
+            return  # nothing was compiled
+        kept.parent.mkdir(exist_ok=True)
+        kept.write_text(json.dumps(sizes, indent=1), "utf-8")
 
     def _build_with_flags(self) -> None:
         for extension in self.extensions:
