@@ -31,7 +31,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, Stage, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats.container import Place
+from fhash_formats.container import Place, is_container
 from fhash_formats.container.header import PAPER
 from fhash_formats.container.reader import Split
 from fhash_formats.errors import InputError
@@ -81,7 +81,7 @@ class Report(Sizes):
 class EncodeReport(Report):
     """Figures of a file that was encoded."""
 
-    stages: NotRequired[Annotated[list[dict[str, Any]], list[Stage], "`--explain`"]]
+    stages: NotRequired[Annotated[list[dict[str, Any]], list[Stage], "`--verbose`"]]
 
 
 class Compared(Report):
@@ -169,16 +169,42 @@ def steps_of_ssim(series: Series, budget: int = SSIM_BUDGET) -> list[int]:
     return ssim_steps(series.shape[0], prod(series.shape[1:]), budget) if budget else []
 
 
+class DecodedSeries(Series):
+    """The decoded values of a volume as a series; the volume stays the caller's."""
+
+    def __init__(self, volume: Volume) -> None:
+        self.source, self.name, self.units = str(volume.path), volume.name, volume.units
+        self.dtype, self.shape, self.coords = volume.dtype, volume.shape, volume.coords
+        self.attributes = volume.attrs
+        exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
+        self._frames = DecodedFrames(volume, exact=exact)
+
+    def read(self, step: int) -> npt.NDArray[Any]:
+        """One decoded frame (z, y, x)."""
+        self.require_step(step)
+        return np.ascontiguousarray(self._frames.read(range(step, step + 1))[0], self.dtype)
+
+
 def diff(
-    source: Source, path: Place, *, variable: str | None = None, progress: Progress = silent
+    source: Source | Volume,
+    path: Place,
+    *,
+    variable: str | None = None,
+    progress: Progress = silent,
 ) -> Compared:
     """Decode every step of the container `path`, or at a URL, and measure it against the data.
 
+    source: data, or another container or a Volume of one, whose decoded values are the reference.
     variable: which one of the container, where it has several.
 
     Raises InputError if the shapes differ, DamagedFileError for a damaged container.
     """
     begun = time.perf_counter()
+    if isinstance(source, str | Path) and is_container(source):
+        with open_volume(source, variable=variable) as reference:
+            return diff(reference, path, variable=variable, progress=progress)
+    if isinstance(source, Volume):
+        source = DecodedSeries(source)
     with open_source(source) as series, open_volume(path, variable=variable) as volume:
         if series.shape != volume.shape:
             raise InputError(

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from fhash_codec.progress import Progress, silent
-from fhash_codec.volume import Volume
+from fhash_codec.volume import Volume, open_container
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.errors import InputError
 from fhash_formats.series import meant
@@ -33,7 +33,7 @@ def open(
     Returns the Volume of one variable, or the Dataset of a file of several. Raises what
     `Container.open` raises, and InputError where the file does not hold the variable.
     """
-    container = Container.open(path, storage_options=storage_options)
+    container = open_container(path, storage_options)
     try:
         if container.variables and variable is None:
             return Dataset(container, fill=fill)

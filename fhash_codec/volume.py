@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -29,7 +30,12 @@ from fhash_codec.times import Time, times_of
 from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.container.header import EVERYTHING, MISSING_ARRAY
-from fhash_formats.errors import InputError, MissingDependencyError, RegionError
+from fhash_formats.errors import (
+    DamagedFileError,
+    InputError,
+    MissingDependencyError,
+    RegionError,
+)
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
 from fhash_formats.transform.values import about_origin
@@ -152,6 +158,23 @@ OUTSIDE = ("nan", "background")
 """Choices of what `read` gives outside the coreset."""
 
 
+def open_container(path: Place, storage_options: StorageOptions = None) -> Container:
+    """Open a container; raises InputError for data that are not encoded, else as it does."""
+    try:
+        return Container.open(path, storage_options=storage_options)
+    except DamagedFileError as error:
+        if not isinstance(path, str | os.PathLike):
+            raise
+        from fhash_formats.readers.registry import recognised
+
+        kind = recognised(os.fspath(path))
+        if kind is None:
+            raise
+        raise InputError(
+            f"{path} is {kind} data, no container; encode it first: fhash encode {path}"
+        ) from error
+
+
 def open(
     path: Place,
     *,
@@ -168,7 +191,7 @@ def open(
     Nothing is decoded yet. Raises what `Container.open` raises, and InputError where the file does
     not hold the variable, or holds several and none is named.
     """
-    container = Container.open(path, storage_options=storage_options)
+    container = open_container(path, storage_options)
     try:
         return Volume(container.select(variable), fill=fill)
     except BaseException:

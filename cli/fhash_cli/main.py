@@ -21,33 +21,57 @@ from typing import Any, cast
 
 import click
 
-from fhash_cli.output import describe_error, error_object, print_json, printed, say, warn
-from fhash_formats.errors import FhashWarning, InterruptedEncodingError, MissingDependencyError
+from fhash_cli.output import (
+    describe_error,
+    error_object,
+    one_line,
+    print_json,
+    printed,
+    say,
+    warn,
+)
+from fhash_formats.errors import (
+    FhashWarning,
+    InterruptedEncodingError,
+    MissingDependencyError,
+    suggestion,
+)
 
-COMMANDS = {
-    "encode": "fit a series and write it as RUN.fhz",
-    "plan": "choose tiles and settings once, for `fhash encode --part --plan`",
-    "merge": "join the parts that `fhash encode --part` wrote",
-    "append": "code further steps behind those of RUN.fhz",
-    "pack": "make RUN.fhz of coded Zarr arrays, without coding again",
-    "unpack": "make coded Zarr arrays of RUN.fhz, without coding again",
-    "decode": "rebuild a region of RUN.fhz, at any time",
-    "render": "draw a picture of RUN.fhz",
-    "view": "show RUN.fhz in a browser",
-    "info": "say what RUN.fhz holds and how good it is",
-    "serve": "give decoded values of RUN.fhz over HTTP, as Zarr, to any client",
-    "export": "write the model of RUN.fhz in plain numbers, for any Zarr library",
-    "hdf5-plugin-path": "print the folder of the filter for HDF5, for HDF5_PLUGIN_PATH",
-    "paraview": "open RUN.fhz in ParaView, or print the path of its reader",
-    "verify": "read and check every part of RUN.fhz",
-    "diff": "measure RUN.fhz against the data it was made from",
-    "demo": "simulate, encode, decode, compare, draw",
-    "cost": "measure what accuracy costs in time and bytes on your data",
-    "bench": "measure speed on this machine",
-    "selftest": "check hard cases on this machine",
-    "completion": "print the shell code that completes fhash's words on Tab",
+TASKS = {
+    "Start here": {
+        "info": "say what a file holds, what to type to encode it, and how good a RUN.fhz is",
+        "encode": "fit a series and write it as RUN.fhz",
+        "render": "draw a picture or a film of RUN.fhz",
+        "view": "show RUN.fhz in a browser",
+        "decode": "rebuild a region of RUN.fhz, at any time, in another format",
+        "demo": "simulate, encode, decode, compare, draw",
+    },
+    "Measure": {
+        "diff": "measure RUN.fhz against its data, or against another file",
+        "cost": "measure what accuracy costs in time and bytes on your data",
+        "verify": "read and check every part of RUN.fhz",
+        "bench": "measure fhash and other codecs on this machine",
+        "selftest": "check hard cases on this machine",
+    },
+    "Long and parallel runs": {
+        "append": "code further steps behind those of RUN.fhz",
+        "plan": "choose tiles and settings once, for `fhash encode --part --plan`",
+        "merge": "join the parts that `fhash encode --part` wrote",
+    },
+    "Other tools": {
+        "paraview": "open RUN.fhz in ParaView, or print the path of its reader",
+        "serve": "serve decoded values of RUN.fhz over HTTP, as Zarr",
+        "export": "write the model of RUN.fhz in plain numbers, for any Zarr library",
+        "pack": "make RUN.fhz of coded Zarr arrays, without coding again",
+        "unpack": "make coded Zarr arrays of RUN.fhz, without coding again",
+        "hdf5-plugin-path": "print the folder of the filter for HDF5, for HDF5_PLUGIN_PATH",
+        "completion": "print the shell code that completes fhash's words on Tab",
+    },
 }
-"""Help line of each command; its module of `fhash_cli.commands` is imported only on use."""
+"""Commands by what people want of them, with their help lines; the module of one in
+`fhash_cli.commands` is imported only on use."""
+COMMANDS = {name: text for task in TASKS.values() for name, text in task.items()}
+"""Help line of each command."""
 DISTRIBUTIONS = {"bench": "fhash[bench]"}
 """Commands of other distributions, entry points of the group `fhash.commands`, and what installs
 them."""
@@ -83,8 +107,18 @@ class Program(click.Group):
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands for `--help`, without importing them."""
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()), col_max=10)  # one name is longer
+        for task, commands in TASKS.items():
+            with formatter.section(task):
+                formatter.write_dl(list(commands.items()), col_max=10)  # one name is longer
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of a line; raises UsageError for an unknown one, with the likeliest."""
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            likely = suggestion(args[0], COMMANDS)
+            raise click.UsageError(f"No such command '{one_line(args[0])[:60]}'; {likely}", ctx)
+        return super().resolve_command(ctx, args)
 
     def invoke(self, context: click.Context) -> Any:
         """Run the command; each warning is one line on stderr.

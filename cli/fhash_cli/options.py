@@ -71,6 +71,74 @@ SLICE = TextType("A:B:S", _slice)
 """
 
 
+NUMBERS = {2: "A,B", 3: "X,Y,Z"}
+"""Placeholders of options that take so many numbers."""
+
+
+def numbers_type(count: int) -> TextType:
+    """A fixed count of numbers with commas; the scene checks later whether they are allowed."""
+
+    def parsed(text: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != count:
+            raise ValueError(
+                f"'{text}' is not {count} numbers with commas between them,"
+                f" such as {','.join('123'[:count])}"
+            )
+        return numbers
+
+    return TextType(NUMBERS[count], parsed)
+
+
+def _size(text: str) -> tuple[int, int]:
+    across, _, down = text.lower().partition("x")
+    try:
+        return int(across), int(down or across)
+    except ValueError:
+        raise ValueError(f"'{text}' is not a size in pixels such as 800x600") from None
+
+
+SIZE = TextType("WxH", _size)
+"""Pixels across and down, or one number for both."""
+
+
+def opacity_type(*, named: bool = True) -> TextType:
+    """Points VALUE:OPACITY with commas between them, or (`named`) the name of a preset."""
+
+    def parsed(text: str) -> Any:
+        if named and ":" not in text:
+            return text
+        try:
+            return [[float(end) for end in part.split(":")] for part in text.split(",")]
+        except ValueError:
+            what = "neither the name of an opacity nor" if named else "not"
+            raise ValueError(f"'{text}' is {what} points such as 0:0,0.5:0.2,2:1") from None
+
+    return TextType("NAME|V:O,..." if named else "G:F,...", parsed)
+
+
+def _plane(text: str) -> dict[str, Any]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 4:
+        return {"normal": numbers[:3], "offset": numbers[3]}
+    if len(numbers) == 6:
+        return {"point": numbers[:3], "normal": numbers[3:]}
+    raise ValueError(
+        f"'{text}' is neither a normal and an offset, NX,NY,NZ,D, nor a point and a normal,"
+        " X,Y,Z,NX,NY,NZ, such as 0,0,1,0.5"
+    )
+
+
+PLANE = TextType("NX,NY,NZ,D", _plane)
+"""Settings of a ClipPlane: its normal and an offset, or a point of it and its normal."""
+
+
 class IntervalsType(TextType):
     """Intervals along z, y and x, of indices or (`number=float`) of positions.
 
@@ -419,7 +487,13 @@ class RealRange(click.FloatRange):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """The number; fails for NaN and for a number outside the limits."""
+        """The number; fails for NaN and for a number outside the limits. A share may be in %."""
+        if isinstance(value, str) and value.strip().endswith("%"):
+            name = "" if param is None else param.opts[0]
+            if not name.endswith("-rel"):
+                share = "" if name != "--max-error" else "; --max-error-rel is a share of the range"
+                self.fail(f"'{value}' is a share, and {name} is in data units{share}", param, ctx)
+            value = click.FLOAT(value.strip()[:-1], param, ctx) / 100
         number = float(super().convert(value, param, ctx))
         if math.isnan(number):
             self.fail(f"'{value}' is not a number", param, ctx)

@@ -31,10 +31,6 @@ from fhash_formats.errors import (
 
 QUIET_SECONDS = 1.0
 """Seconds of a command that show no progress, so that short commands stay silent."""
-LINES_AFTER = 2.0
-"""Seconds of a stage from which on it prints lines where there is no terminal."""
-LINE_SECONDS = 10.0
-"""Seconds after which a line is printed at the latest where there is no terminal."""
 BEAT_SECONDS = 0.5
 """Seconds between two looks at the clock while no report comes."""
 DRAW_SECONDS = 0.1
@@ -79,24 +75,21 @@ class Progress:
     """The codec's progress callback (stage, done, total, note), as a context manager.
 
     On a terminal it draws a bar from QUIET_SECONDS on. The bar shows the time that passed, so that
-    it moves even while no report comes. Elsewhere it prints a line every 10 % of a stage that takes
-    longer than LINES_AFTER, and one every LINE_SECONDS. `quiet` shows nothing at all. Leaving the
+    it moves even while no report comes. Elsewhere, and with `quiet`, it shows nothing. Leaving the
     context removes the bar.
     """
 
     def __init__(self, *, quiet: bool) -> None:
-        self.quiet = quiet
-        self.terminal = sys.stderr is not None and sys.stderr.isatty()
+        self.quiet = quiet or sys.stderr is None or not sys.stderr.isatty()
         self._stage, self._done, self._total, self._note = "", 0, 1, ""
         self._begun = self._stage_begun = self._last = time.monotonic()
-        self._shown = self._said = self._begun
-        self._tenth = 0
+        self._shown = self._begun
         self._lock = threading.RLock()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Progress:
-        if not self.quiet and sys.stderr is not None:
+        if not self.quiet:
             self._thread = threading.Thread(target=self._watch, name="fhash-progress", daemon=True)
             self._thread.start()
         return self
@@ -118,22 +111,15 @@ class Progress:
             now = time.monotonic()
             if stage != self._stage:
                 # The first report may follow the first part: the stage began after the last.
-                self._stage, self._stage_begun, self._tenth = stage, self._last, 0
+                self._stage, self._stage_begun = stage, self._last
             self._last = now
             self._done, self._total, self._note = done, max(total, 1), note
-            if self.terminal:
-                self._draw(now, whole=done == total)
-            else:
-                self._line(now)
+            self._draw(now, whole=done == total)
 
     def beat(self) -> None:
         """Show that time passes, where no report came."""
         with self._lock:
-            now = time.monotonic()
-            if self.terminal:
-                self._draw(now)
-            elif self._stage and now - self._said >= LINE_SECONDS:
-                self._print(now)
+            self._draw(time.monotonic())
 
     def erase(self) -> None:
         """Remove the bar; the next report draws it again."""
@@ -148,20 +134,6 @@ class Progress:
                 self.beat()
             except (OSError, ValueError):  # stderr was closed
                 return
-
-    def _line(self, now: float) -> None:
-        """Print a line if a stage that takes long has come to another tenth."""
-        tenth = math.floor(10 * self._done / self._total)
-        if now - self._stage_begun < LINES_AFTER:
-            self._tenth = tenth
-        elif tenth > self._tenth or now - self._said >= LINE_SECONDS:
-            self._tenth = max(tenth, self._tenth)
-            self._print(now)
-
-    def _print(self, now: float) -> None:
-        self._said = now
-        share = f" {self._done / self._total:.0%}" if self._total > 1 else ""
-        say(f"{self._stage}{share}{self._remarks(now)}")
 
     def _draw(self, now: float, *, whole: bool = False) -> None:
         """Draw the bar, unless it was drawn a moment ago."""
@@ -478,7 +450,7 @@ def loss_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
 def describe_error(error: Exception) -> tuple[str, int]:
     """One line that says what went wrong, and the exit code."""
     if isinstance(error, FhashError):
-        line, code = str(error), error.exit_code
+        line, code = str(error).replace(" (force=True)", ""), error.exit_code
     elif isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         hint = f" (see '{context.command_path} --help')" if context is not None else ""

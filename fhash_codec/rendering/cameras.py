@@ -167,7 +167,7 @@ def view_of(name: str, grid: Grid) -> str:
     return "iso" if grid.thin is None else ("yz", "xz", "xy")[grid.thin]
 
 
-USUAL_SIZE = 512
+USUAL_SIZE = 1024
 """Pixels of the longer side of a picture."""
 LEAST_SIZE = 128
 """Pixels of the shorter side, at least."""

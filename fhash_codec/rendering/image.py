@@ -10,7 +10,7 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -37,7 +37,7 @@ from fhash_codec.rendering.layout import (
     wrapped,
 )
 from fhash_codec.rendering.scenes import DIGEST_KEY, SCENE_KEY, SOURCE_KEY, Effects, Scene
-from fhash_codec.rendering.view import Body, Edge, edges, outer_edges
+from fhash_codec.rendering.view import Body, edges, outer_edges
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
 from fhash_formats.support.files import check_output, replacing_all
@@ -255,26 +255,26 @@ class Pen:
         """The layers of all texts so far, the lower one first."""
         return (self.halo, _opacity(self._halos)), (self.ink, _opacity(self._letters))
 
-    def lines(self, edges: list[Edge], view: tuple[int, int, int, int]) -> Single:
-        """The opacity (H, W) of edges; they are drawn larger and reduced, to be smooth.
+    def lines(self, lines: Sequence[Double], view: tuple[int, int, int, int]) -> Single:
+        """The opacity (H, W) of lines (2, 2); they are drawn larger and reduced, to be smooth.
 
-        view: left, top, width and height of the part that the ends of the edges are counted in, and
-        beyond which nothing is drawn.
+        view: left, top, width and height of the part that their ends are counted in, and beyond
+        which nothing is drawn.
         """
         from PIL import Image as Pictures
         from PIL import ImageDraw
 
         opacity = np.zeros((self.height, self.width), dtype=np.float32)
         left, top, width, height = view
-        if not edges:
+        if not lines:
             return opacity
         finer = 4 if max(width, height) <= 1024 else 2 if max(width, height) <= 4096 else 1
         mask = Pictures.new("L", (width * finer, height * finer))
         draw = ImageDraw.Draw(mask)
         far = 32.0 * max(width, height)  # an edge that passes close by the camera ends anywhere
         thick = max(1, round(finer * font_size(self.width, self.height) / 11))
-        for edge in edges:
-            ends = np.clip(edge.ends, -far, far) * finer
+        for line in lines:
+            ends = np.clip(line, -far, far) * finer
             draw.line([*ends[0], *ends[1]], 255, thick)
         inner = _opacity(mask.reduce(finer)) * np.float32(LINE_OPACITY)
         opacity[top : top + height, left : left + width] = inner
@@ -292,6 +292,14 @@ class Pen:
         canvas.fill((left - 1, top - 1, right + 1, bottom + 1), self.ink)
         share = (np.arange(tall)[::-1, None] + 0.5) / tall
         canvas.fill(bar.box, colours(low * (1 - share) + high * share))
+        for end, there in enumerate(bar.beyond):  # a triangle where values lie beyond the colours
+            for step in range(thick := (right - left) // 2 if there else 0):
+                at = top - 2 - step if end else bottom + 1 + step
+                inner = left - 1 + step, right + 1 - step
+                canvas.fill((inner[0], at, inner[1], at + 1), self.ink)
+                if step + 1 < thick:
+                    shown = colours(np.array(high if end else low))
+                    canvas.fill((inner[0] + 1, at, inner[1] - 1, at + 1), shown)
         stroke, pitch = max(1, bar.size // 12), line_height(bar.size)
         for value, text in bar.marks:
             row = top + (tall - 1) * (1 - (value - low) / ((high - low) or 1.0))
@@ -299,7 +307,8 @@ class Pen:
             canvas.fill((right, mark, right + bar.size // 4, mark + stroke), self.ink)
             self.text((right + bar.size // 4 + 2, row), text, bar.size)
         for number, line in enumerate(reversed(bar.title)):
-            self.text((left - 2, top - (number + TITLE_GAP) * pitch), line, bar.size)
+            over = (right - left) / 2 if bar.beyond[1] else 0.0
+            self.text((left - 2, top - over - (number + TITLE_GAP) * pitch), line, bar.size)
         return canvas.colours, canvas.opacity
 
     def legend(self, legend: Legend) -> Layer:
@@ -385,10 +394,11 @@ def overlay(
             shown += outer_edges(rays)  # of all of the volume
         # The volume lies inside the box: an edge between two faces that look away lies behind all
         # of the volume, any other edge before all of it.
-        behind = pen.lines([edge for edge in shown if edge.fronts == 0], layout.view)
+        behind = pen.lines([edge.ends for edge in shown if edge.fronts == 0], layout.view)
         _paint_behind(picture, pen.ink, behind)
-        before = pen.lines([edge for edge in shown if edge.fronts > 0], layout.view)
+        before = pen.lines([edge.ends for edge in shown if edge.fronts > 0], layout.view)
         layers.append((pen.ink, before))
+        layers.append((pen.ink, pen.lines(layout.marks, (0, 0, width, height))))
     for text in layout.labels:
         pen.write(text)
     if layout.time is not None and label:

@@ -196,9 +196,9 @@ Rectangle = tuple[float, float, float, float]
 NAME_PLACES = (0.5, 0.42, 0.58, 0.34, 0.66, 0.26, 0.74, 0.18, 0.82)
 """Places of a name along its edge, as shares of it, in the order in which they are tried."""
 NAME_DISTANCES = (0.0, 1.5, 3.5, 6.0, 9.0)
-"""Distances of a name from its usual place beside the edge, in heights of the font."""
-END_PLACES = (0.5, 1.2, 2.0, 3.0, 4.0)
-"""Distances of a coordinate from its end of the edge, in heights of the font."""
+"""Distances of a name from its usual place beyond the numbers, in heights of the font."""
+MARK = 0.35
+"""Length of a tick mark in heights of the font."""
 SHORTEST = 2.5
 """Length of an edge below which it has no scale, in heights of the font."""
 LONG = 4
@@ -217,8 +217,8 @@ def scales(
     size: int,
     *,
     breaking: int,
-) -> tuple[list[Label], int]:
-    """Place the scales of the axes: labels without overlap, and the number of all labels.
+) -> tuple[list[Label], list[Double], int]:
+    """Place the scales of the axes: labels without overlap, tick marks (2, 2), names left out.
 
     Args:
         rays: of the part of the picture that shows the volume.
@@ -229,17 +229,25 @@ def scales(
         breaking: 0 for names in one line, 1 with units in a line of their own, 2 in lines no longer
             than WRAPPED of the frame.
     """
-    wanted: list[list[Label]] = []
+    placed: list[Label] = []
+    marks: list[Double] = []
+    missing = 0
+    names: list[Iterator[Label]] = []
     for edge in outer_edges(rays):
         coordinate = coords["xyz"[edge.axis]]
         lines = _name(coordinate, size, breaking, WRAPPED * (frame[2] - frame[0]))
-        wanted += _of_edge(edge, rays, view, coordinate, lines, size)
-    placed: list[Label] = []
-    for candidates in wanted:
+        found = _of_edge(edge, rays, view, coordinate, lines, size)
+        if found is not None:
+            marks += found.marks
+            placed += [label for label in found.numbers if not _covered(label, placed)]
+            names.append(found.names)
+    for candidates in names:
         free = [label for label in candidates if not _covered(label, placed)]
         if free:
             placed.append(min(free, key=lambda label: round(sum(overflow([label], frame)), 3)))
-    return placed, len(wanted)
+        else:
+            missing += 1
+    return placed, marks, missing
 
 
 def overflow(labels: Sequence[Label], frame: Rectangle) -> tuple[float, float, float, float]:
@@ -266,21 +274,19 @@ def _name(coordinate: Coordinate, size: int, breaking: int, limit: float) -> tup
     return lines if breaking else (" ".join(lines),)
 
 
-def end_texts(first: float, last: float) -> tuple[str, str]:
-    """Texts of the first and the last coordinate, with 4 digits of their distance or more."""
-    extent = abs(last - first)
-    if not (math.isfinite(first) and math.isfinite(last)) or extent == 0:
-        return f"{first:.6g}", f"{last:.6g}"
-    places = 3 - math.floor(math.log10(extent))
-    largest = max(abs(first), abs(last))
-    if places > 8 or largest >= 1e9:
-        digits = min(max(math.ceil(math.log10(largest / extent)) + 3, 3), 15)
-        return f"{first:.{digits}g}", f"{last:.{digits}g}"
-    texts = [f"{round(value, places) + 0.0:.{max(places, 0)}f}" for value in (first, last)]
-    first_text, last_text = (
-        text.rstrip("0").rstrip(".") if "." in text else text for text in texts
-    )
-    return first_text, last_text
+@dataclass(frozen=True, kw_only=True)
+class _Scale:
+    """The scale of an edge.
+
+    Attributes:
+        marks: pixels (2, 2) of the ends of each tick mark.
+        numbers: labels of the ticks.
+        names: places that the name of the axis may have, the best first.
+    """
+
+    marks: list[Double]
+    numbers: list[Label]
+    names: Iterator[Label]
 
 
 def _of_edge(
@@ -290,17 +296,16 @@ def _of_edge(
     coordinate: Coordinate,
     lines: tuple[str, ...],
     size: int,
-) -> Iterator[list[Label]]:
-    """Yield the places that each label of an edge may have, the best first."""
+) -> _Scale | None:
+    """The scale of an edge; None where it is too short for one, or out of view."""
     offset = np.array(view[:2])
-    visible = _clipped(edge.ends + offset, view)
-    if visible is None:
-        return
-    ends, whole = visible
+    ends = _clipped(edge.ends + offset, view)
+    if ends is None:
+        return None
     along = ends[1] - ends[0]
     extent = float(np.linalg.norm(along))
     if extent < SHORTEST * size:
-        return
+        return None
     along = along / extent
     centre = rays.project(rays.grid.bounds.mean(axis=1)[None])[0][0] + offset
     outward = np.array([-along[1], along[0]])
@@ -309,36 +314,56 @@ def _of_edge(
         abs(float(along[1])) > STEEP and max(length(line, size) for line in lines) > LONG * size
     )
 
-    def beside(place: Double, label: Label) -> Label:
-        """The label outside the edge, at a place of it."""
+    def beside(place: Double, label: Label, far: float = 0.5) -> Label:
+        """The label outside the edge, `far` heights of the font from a place of it."""
         wide, tall = label.extent
         reach = abs(float(outward[0])) * wide / 2 + abs(float(outward[1])) * tall / 2
-        x, y = place + outward * (reach + 0.5 * size)
+        x, y = place + outward * (reach + far * size)
         return replace(label, centre=(float(x), float(y)))
 
+    marks, numbers = [], []
+    for place, text in _ticks_along(edge, rays, coordinate, extent, along, size):
+        at = place + offset
+        if view[0] - 1 <= at[0] <= view[2] + 1 and view[1] - 1 <= at[1] <= view[3] + 1:
+            marks.append(np.array([at, at + outward * MARK * size]))
+            numbers.append(beside(at, Label(lines=(text,), centre=(0.0, 0.0), size=size)))
     name = Label(lines=lines, centre=(0.0, 0.0), size=size, upright=upright)
-    first, last = end_texts(*(float(value) for value in coordinate.values[[0, -1]]))
-    for end, text, there, back in (
-        (ends[0], first, whole[0], along),
-        (ends[1], last, whole[1], -along),
-    ):
-        if there:
-            number = Label(lines=(text,), centre=(0.0, 0.0), size=size)
-            yield [
-                beside(end + back * min(far * size, 0.45 * extent), number) for far in END_PLACES
-            ]
-    # A long name lies beyond the numbers, if it must.
-    yield [
-        replace(
-            label,
-            centre=(
-                label.centre[0] + float(outward[0]) * far * size,
-                label.centre[1] + float(outward[1]) * far * size,
-            ),
-        )
+    reach = max((abs(float(outward @ np.array(label.extent))) for label in numbers), default=0.0)
+    names = (
+        beside(ends[0] + along * share * extent, name, 0.7 + reach / size + far)
         for far in NAME_DISTANCES
-        for label in (beside(ends[0] + along * share * extent, name) for share in NAME_PLACES)
-    ]
+        for share in NAME_PLACES
+    )
+    return _Scale(marks=marks, numbers=numbers, names=names)
+
+
+def _ticks_along(
+    edge: Edge, rays: Rays, coordinate: Coordinate, extent: float, along: Double, size: int
+) -> list[tuple[Double, str]]:
+    """Pixels (2,) and texts of the ticks of an edge: as many as it has room for."""
+    grid, axis = rays.grid, edge.axis
+    first, last = (float(value) for value in coordinate.values[[0, -1]])
+    low, high = grid.bounds[axis]
+    found: list[tuple[Double, str]] = []
+    for count in range(max(2, min(8, int(extent / (4 * size)))), 0, -1):
+        marked = ticks(min(first, last), max(first, last), count)
+        values = np.array([value for value, _ in marked])
+        share = np.full(len(values), 0.5)
+        if grid.counts[axis] > 1 and high > low:
+            at = (values * grid.scale[axis] - grid.origin[axis]) / grid.spacing[axis]
+            share = (at - low) / (high - low)
+        places = edge.places[0] + share[:, None] * (edge.places[1] - edge.places[0])
+        pixels, _ = rays.project(places)
+        found = [(pixel, text) for pixel, (_, text) in zip(pixels, marked, strict=True)]
+        widest = max(length(text, size) for _, text in found) + 0.6 * size
+        needed = min(
+            widest / max(abs(float(along[0])), 1e-6),
+            1.3 * size / max(abs(float(along[1])), 1e-6),
+        )
+        apart = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
+        if len(marked) < 3 or apart.min() > needed:
+            break
+    return found
 
 
 def _covered(label: Label, others: Sequence[Label]) -> bool:
@@ -350,8 +375,8 @@ def _covered(label: Label, others: Sequence[Label]) -> bool:
     )
 
 
-def _clipped(ends: Double, view: Rectangle) -> tuple[Double, tuple[bool, bool]] | None:
-    """The part of a line (2, 2) within a rectangle, and whether each end is in it; None if none is.
+def _clipped(ends: Double, view: Rectangle) -> Double | None:
+    """The part of a line (2, 2) within a rectangle; None if none is.
 
     Liang and Barsky's method.
     """
@@ -371,10 +396,7 @@ def _clipped(ends: Double, view: Rectangle) -> tuple[Double, tuple[bool, bool]] 
                 end = min(end, -inside / change)
     if not begin < end or not math.isfinite(begin + end):
         return None
-    return np.array([ends[0] + begin * along, ends[0] + end * along]), (
-        begin < 1e-6,
-        end > 1 - 1e-6,
-    )
+    return np.array([ends[0] + begin * along, ends[0] + end * along])
 
 
 BAR_HEIGHT = 0.55
@@ -405,12 +427,14 @@ class Bar:
         marks: values with their texts, ascending.
         title: lines of the name, above the colours.
         size: height of the font in pixels.
+        beyond: whether there are values below and above the colours' ends.
     """
 
     box: tuple[int, int, int, int]
     marks: tuple[tuple[float, str], ...]
     title: tuple[str, ...]
     size: int
+    beyond: tuple[bool, bool] = (False, False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -434,6 +458,7 @@ class Layout:
         size: width and height of the picture.
         view: left, top, width and height of the part that shows the volume.
         labels: of the axes.
+        marks: of their ticks, pixels (2, 2) of the ends of each.
         time: left, top, right and bottom of the strip of the time label; None without one.
         bar: the colour bar; None without one.
         legend: the legend; None without one.
@@ -442,13 +467,19 @@ class Layout:
     size: tuple[int, int]
     view: tuple[int, int, int, int]
     labels: tuple[Label, ...] = ()
+    marks: tuple[Double, ...] = ()
     time: Rectangle | None = None
     bar: Bar | None = None
     legend: Legend | None = None
 
 
 def lay_out(
-    scene: Scene, grid: Grid, coords: Mapping[str, Coordinate], colours: ColourMap, quantity: str
+    scene: Scene,
+    grid: Grid,
+    coords: Mapping[str, Coordinate],
+    colours: ColourMap,
+    quantity: str,
+    value_range: tuple[float, float] | None = None,
 ) -> tuple[Layout, Rays]:
     """Lay a picture out, and place the rays of the part that shows the volume.
 
@@ -458,10 +489,11 @@ def lay_out(
         coords: of the axes.
         colours: of the colour bar.
         quantity: name of the colour bar, with units.
+        value_range: of the series, whose ends the colour bar marks where it does not reach them.
 
     Raises InputError as `Rays.of` does.
     """
-    layout = strips(scene.size, scene.effects, colours, quantity)
+    layout = strips(scene.size, scene.effects, colours, quantity, value_range)
     rays = Rays.of(scene.camera, grid, layout.view[2:])
     if not scene.effects.axes:
         return layout, rays
@@ -473,7 +505,7 @@ def lay_out(
             if tried[-1].complete and tried[-1].share >= GOOD_VIEW:
                 return tried[-1].layout, tried[-1].rays
     # Every text first, then the volume.
-    best = max(tried, key=lambda one: (one.fits, len(one.layout.labels), min(one.share, GOOD_VIEW)))
+    best = max(tried, key=lambda one: (one.fits, one.complete, min(one.share, GOOD_VIEW)))
     return best.layout, best.rays
 
 
@@ -483,7 +515,7 @@ class _Trial:
 
     Attributes:
         fits: whether no label reaches out of the frame.
-        complete: whether it does and every label of the largest view is there.
+        complete: whether it does and the name of every axis is there.
         share: of the frame's area that the view keeps.
     """
 
@@ -512,7 +544,6 @@ def _with_scales(
     frame = (float(left), float(top), float(left + width), float(top + height))
     sides = list(frame)
     least = SMALLEST_VIEW * width, SMALLEST_VIEW * height
-    most = 0
     for _ in range(TRIALS):
         view = (
             round(sides[0]),
@@ -522,15 +553,14 @@ def _with_scales(
         )
         rays = Rays.of(scene.camera, grid, view[2:])
         area = (float(view[0]), float(view[1]), float(view[0] + view[2]), float(view[1] + view[3]))
-        labels, wanted = scales(rays, area, frame, coords, size, breaking=breaking)
-        most = max(most, wanted)
+        labels, marks, missing = scales(rays, area, frame, coords, size, breaking=breaking)
         beyond = overflow(labels, frame)
         fits = max(beyond) < 0.5
         trial = _Trial(
-            layout=replace(layout, view=view, labels=tuple(labels)),
+            layout=replace(layout, view=view, labels=tuple(labels), marks=tuple(marks)),
             rays=rays,
             fits=fits,
-            complete=fits and len(labels) == most,
+            complete=fits and not missing,
             share=view[2] * view[3] / (width * height),
         )
         if fits:
@@ -545,7 +575,13 @@ def _with_scales(
     return trial
 
 
-def strips(size: tuple[int, int], effects: Effects, colours: ColourMap, quantity: str) -> Layout:
+def strips(
+    size: tuple[int, int],
+    effects: Effects,
+    colours: ColourMap,
+    quantity: str,
+    value_range: tuple[float, float] | None = None,
+) -> Layout:
     """Lay out the strips of time label, colour bar and legend; the view is the rest.
 
     In a picture that is too small for them the view is all of it, and they lie over it.
@@ -559,6 +595,9 @@ def strips(size: tuple[int, int], effects: Effects, colours: ColourMap, quantity
     right = 0
     if effects.colour_bar:
         bar = _bar(colours, quantity, letters, size, (top, height - bottom))
+        low, high = value_range or colours.positions[[0, -1]]
+        beyond = bool(low < colours.positions[0]), bool(high > colours.positions[-1])
+        bar = replace(bar, beyond=beyond)
         right = width - bar.box[0] + letters // 2
     view = (0, top, width - right, height - top - bottom)
     if view[2] < SMALLEST_VIEW * width or view[3] < SMALLEST_VIEW * height:

@@ -376,9 +376,9 @@ def plan_picture(
     grid = Grid.of_volume(volume, scene.scale)
     function = _function(volume, scene, grid, histogram)
     _warn_of_unseen_surfaces(volume, scene)
-    layout, rays = lay_out(
-        scene, grid, volume.coords, function.colours, quantity_of(volume.name, volume.units)
-    )
+    quantity = quantity_of(volume.name, volume.units)
+    reach = (volume.value_range.low, volume.value_range.high)
+    layout, rays = lay_out(scene, grid, volume.coords, function.colours, quantity, reach)
     lod, why_lod = _level(volume, scene, rays)
     shadows, occlusion = secondary_light(scene, grid)
     lamp = lamp_of(rays, scene.effects.shading, shadows)
@@ -507,15 +507,21 @@ def _function(
         )
 
     without = function_of(None)
-    if histogram is None or spec.opacity != "auto" or spec.nothing:
+    if histogram is None or (spec.range is not None and (spec.opacity != "auto" or spec.nothing)):
         return without
     (low, high), scale = value_range, volume.value_range.scale
     if not low < high:
         return without
-    # Whether the opacity depends on a histogram at all is tried with a made-up one of one bin.
+    # Whether anything depends on a histogram is tried with a made-up one of one bin.
     edges = np.linspace(low * scale, high * scale, 9) / scale
     probe = function_of((edges, np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64)))
-    if np.array_equal(without.points, probe.points):
+    if all(
+        np.array_equal(one, other)
+        for one, other in (
+            (without.points, probe.points),
+            (without.colours.positions, probe.colours.positions),
+        )
+    ):
         return without
     return function_of(histogram())
 

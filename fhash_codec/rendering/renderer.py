@@ -22,7 +22,7 @@ from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Marched, Task, complete
 from fhash_codec.rendering.plan import Plan, arrays_of, plan_at, plan_picture
-from fhash_codec.rendering.scenes import MAX_SIDE, Scene
+from fhash_codec.rendering.scenes import MAX_SIDE, USUAL_EFFECTS, Scene
 from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField
 from fhash_codec.rendering.stream_march import stream
 from fhash_codec.rendering.tiled_frame import FrameField, TiledFrame
@@ -226,8 +226,8 @@ class Renderer:
         """Render a scene, or a plan that was made for it.
 
         Args:
-            scene: what to show; the default scene if None. A scene with `evolution` gives several
-                steps side by side.
+            scene: what to show; None for the default scene with USUAL_EFFECTS. One with `evolution`
+                gives several steps side by side.
             plan: a plan of `plan`, in place of a scene.
             upcoming: the scene of the next picture; its frame is decoded while this one is marched.
             progress: is told about each stage.
@@ -246,7 +246,7 @@ class Renderer:
             )
         begin = time.perf_counter()
         if plan is None:
-            plan = self.plan(Scene() if scene is None else scene)
+            plan = self.plan(Scene(effects=USUAL_EFFECTS) if scene is None else scene)
         self._choose(plan.scene.features)
         decoded = self._frame(plan, progress) if plan.lights or not plan.network else None
         if upcoming is not None and plan.decodes_all:  # else the march reads the volume

@@ -343,6 +343,17 @@ class Effects(Record):
         return tuple(name for name, on in kinds.items() if on)
 
 
+USUAL_EFFECTS = Effects(
+    shading=Shading(ambient=0.5, diffuse=0.6),
+    box=True,
+    axes=True,
+    colour_bar=True,
+    time_label=True,
+)
+"""Effects of a picture for which no scene is given. Haze has gradients in all directions, and takes
+more light than a surface."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Marching(Record):
     """Sampling of the rays: accuracy against time."""
@@ -396,7 +407,7 @@ class Scene(Record):
     """Everything that a picture is made from, apart from the volume."""
 
     camera: Camera = Camera()
-    size: tuple[int, int] = limits((512, 512), "pixels across and down", low=1, high=MAX_SIDE)
+    size: tuple[int, int] = limits((1024, 1024), "pixels across and down", low=1, high=MAX_SIDE)
     scale: Vector | None = limits(
         None,
         "factors by which the axes (x, y, z) are stretched; if left out, one in other units than "

@@ -59,6 +59,10 @@ EDGE = 0.1
 """Share of an interval's width over which its opacity rises, and falls again."""
 TENT = 0.02
 """Half the width of an isosurface's tent, as a share of the value range."""
+VISIBLE = 0.02
+"""Share of what is visible that lies beyond each end of the colours."""
+CUT = 0.05
+"""Share of the value range that an end of the colours cuts off, at least."""
 SHARES = np.linspace(0.0, 1.0, 65)
 """Shares of the range shown at which curved presets have points."""
 MAX_VALUE = float(np.finfo(np.float64).max)
@@ -163,6 +167,34 @@ def shown_range(features: Sequence[str], value_range: Range) -> Range:
     if ranges and len(ranges) == len(features):
         low, high = min(inside[0] for inside in ranges), max(inside[1] for inside in ranges)
     return (low, high) if low < high else about(low)
+
+
+def visible_range(histogram: Histogram, points: Double | None, value_range: Range) -> Range:
+    """Choose the values that colours reach over by what is visible: all but VISIBLE of it.
+
+    An end stays that of all values where it cuts less than CUT of them off. Rare peaks would else
+    leave the colours of all that is seen alike.
+
+    Args:
+        histogram: bin edges (n + 1,) and counts (n,) of values.
+        points: (value, opacity) (n, 2), by which a value counts; None where all count alike.
+        value_range: lowest and highest value of the series.
+    """
+    edges, counts = histogram
+    weights = counts.astype(np.float64)
+    if points is not None:
+        seen = weights * np.interp(edges[:-1] / 2 + edges[1:] / 2, *points.T)
+        weights = seen if seen.any() else weights
+    if not weights.any() or not value_range[0] < value_range[1]:
+        return value_range
+    share = np.cumsum(weights) / weights.sum()
+    first, last = np.searchsorted(share, [VISIBLE, 1 - VISIBLE])
+    low, high = float(edges[first]), float(edges[min(int(last), len(counts) - 1) + 1])
+    least = _share_of(value_range, CUT)
+    return (
+        low if low - value_range[0] > least else value_range[0],
+        high if value_range[1] - high > least else value_range[1],
+    )
 
 
 def about(value: float) -> Range:
@@ -364,16 +396,17 @@ class TransferFunction:
                 f"range is {spec.range[0]:g} to {spec.range[1]:g}; "
                 "the first value must be below the second"
             )
-        shown = spec.range or shown_range(features, value_range)
-        colours, preset = _colours(spec, shown)
-        if spec.nothing:
-            points = np.array([[low, 0.0]])
-        elif not isinstance(spec.opacity, str):
-            points = _checked_points(spec.opacity)
-        elif spec.opacity == "auto" and preset is not None and preset.opacity is not None:
-            points = preset.opacity
-        else:
-            points = opacity_preset(
+
+        def points_over(shown: Range) -> Double:
+            """The opacities where the colours reach over some values."""
+            preset = _colours(spec, shown)[1]
+            if spec.nothing:
+                return np.array([[low, 0.0]])
+            if not isinstance(spec.opacity, str):
+                return _checked_points(spec.opacity)
+            if spec.opacity == "auto" and preset is not None and preset.opacity is not None:
+                return preset.opacity
+            return opacity_preset(
                 spec.opacity,
                 shown=shown,
                 value_range=value_range,
@@ -381,6 +414,14 @@ class TransferFunction:
                 histogram=histogram,
                 thinnest=thinnest if spec.unit_distance is None else None,
             )
+
+        shown = spec.range or shown_range(features, value_range)
+        points = points_over(shown)
+        if spec.range is None and histogram is not None and shown == value_range:
+            over = isinstance(spec.opacity, str) and spec.opacity not in ("auto", "feature")
+            shown = visible_range(histogram, None if over else points, value_range)
+            points = points_over(shown)
+        colours, _ = _colours(spec, shown)
         function = cls(
             colours=colours,
             points=points,

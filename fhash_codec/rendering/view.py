@@ -291,6 +291,7 @@ class Edge:
     Attributes:
         axis: 0, 1 or 2 for an edge along x, y or z; -1 for one of a clipped body.
         ends: pixels (2, 2), from the left and from the top, of the first vertex and of the last.
+        places: (2, 3), x, y, z, of the same in index space.
         fronts: number of its faces that look at the camera: 0 behind all of the volume, 1 on the
             outline, 2 before the volume.
         uncut: whether all of the edge lies before the camera, so that nothing is cut off.
@@ -298,6 +299,7 @@ class Edge:
 
     axis: int
     ends: Double
+    places: Double
     fronts: int
     uncut: bool
 
@@ -327,7 +329,9 @@ def edges(rays: Rays, body: Body | None = None) -> list[Edge]:
             axis = int(along.argmax()) if body is None else -1
             pixels, _ = rays.project(clipped)
             fronts = int(looking[one]) + int(looking[other])
-            seen.append(Edge(axis=axis, ends=pixels, fronts=fronts, uncut=clipped is ends))
+            seen.append(
+                Edge(axis=axis, ends=pixels, places=clipped, fronts=fronts, uncut=clipped is ends)
+            )
     return seen
 
 

@@ -95,7 +95,7 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     ):
         words = ["encode", data, "-o", path, "--force", *settings]
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
-        outputs["encode"].append(parsed(fhash(*words, "--json", "-q", "--explain")))
+        outputs["encode"].append(parsed(fhash(*words, "--json", "-q", "-v")))
         outputs["diff"].append(parsed(fhash("diff", data, path, "--json", "-q")))
         outputs["info"].append(parsed(fhash("info", path, "--json")))
     other = tmp_path / "b.fhz"  # of a source with attributes and coordinates of its own

@@ -77,7 +77,7 @@ def test_names_forge_no_line(tmp_path: Path, fhash: Fhash) -> None:
         ["decode", run, "-q"],
         ["verify", run, "-q"],
         ["info", source, "--var", "no\nforged"],
-        ["encode", source, "-o", run, "--explain", "--var", "all", *QUICK],
+        ["encode", source, "-o", run, "-v", "--var", "all", *QUICK],
     ):
         result = fhash(*words)
         for text in (result.stdout, result.stderr):

@@ -295,7 +295,7 @@ def test_force_never_replaces_the_input(
 LINES = [
     ("info", "Missing argument 'RUN.fhz|DATA' (see 'fhash info --help')"),
     ("enode", "No such command 'enode'"),
-    ("encode x", "Missing option '-o'"),
+    ("encode --psnr 50", "Missing argument 'DATA'"),
     ("info x --jsn", "No such option"),
     ("info x y", "unexpected extra argument"),
     (

@@ -441,7 +441,7 @@ def card(run: Run) -> Iterator[Result]:
     from PIL import Image
 
     path, data = run.work / "front.fhz", run.data
-    options = ["--preset=published", "--tables=float16", "--explain"]
+    options = ["--preset=published", "--tables=float16", "-v"]
     words = ["encode", str(data), "-o", str(path), *options]
     encoded = fhash([*words, "--device", run.device, "--epochs", str(run.epochs)])
     trained = fhash(["info", str(path)])["training"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import click
@@ -58,8 +59,12 @@ def verify_command(run: str, variable: str | None, as_json: bool, quiet: bool) -
     emit(result, f"{one_line(run)}: sound, {arrays} arrays checked", as_json)
 
 
-@click.command("diff", cls=BaseCommand, epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01")
-@click.argument("data", type=click.Path())
+@click.command(
+    "diff",
+    cls=BaseCommand,
+    epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01\nfhash diff before.fhz after.fhz",
+)
+@click.argument("data", metavar="DATA|OTHER.fhz", type=click.Path())
 @run_argument
 @series_options
 @click.option(
@@ -85,21 +90,28 @@ def diff_command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Compare RUN.fhz with the DATA it was made from, over all steps.
+    """Compare RUN.fhz with the DATA it was made from, or with OTHER.fhz, over all steps.
 
     Where DATA has several variables, it is the one that RUN.fhz has the name of; where RUN.fhz has
     several, --var chooses one of both. Other differences than of values, such as of units or
     positions, are told on stderr.
     """
     import fhash_codec
+    from fhash_codec.comparison import DecodedSeries
+    from fhash_codec.volume import open as open_volume
 
     if data.endswith(".fhz") and not run.endswith(".fhz"):
         raise click.UsageError(f"the data come first: fhash diff {run} {data}")
     variable = _variable_of(run, source)
-    with Progress(quiet=quiet) as progress, _open(source, data, run, progress) as series:
+    with Progress(quiet=quiet) as progress, ExitStack() as stack:
+        if data.endswith(".fhz"):
+            dataclasses.replace(source, var=None).refuse(data)
+            series = DecodedSeries(stack.enter_context(open_volume(data, variable=variable)))
+        else:
+            series = stack.enter_context(_open(source, data, run, progress))
         report = fhash_codec.diff(series, run, variable=variable, progress=progress)
         fill = None
-        if not source.missing and series.fill is None:
+        if not source.missing and series.fill is None and not data.endswith(".fhz"):
             fill = _missing_of(run, variable)
     if fill is not None and not quiet:
         say(f"{run} was encoded with --missing {fill:.9g}; add it here, or it counts as a value")

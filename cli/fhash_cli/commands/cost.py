@@ -58,8 +58,9 @@ def command(
 ) -> None:
     """Measure what accuracy costs on DATA: seconds and bytes of encoding, reading and drawing.
 
-    The default settings and the network are always measured, of a crop where DATA is large. The
-    most telling of the others follow until the budget is spent; the report says what was left out.
+    The default settings are always measured. The most telling of the others follow until the budget
+    is spent; the report says what was left out. Of large DATA a sample is measured, and seconds and
+    bytes are scaled up to all of it, with an interval.
     Ctrl-C ends the measurements, and the report of what there is by then is written.
     SZ3, SPERR and ZFP come with pip install 'fhash[bench]', as does what the page needs.
     """
@@ -98,13 +99,14 @@ def check_report_folder(folder: Path, force: bool, data: str) -> None:
 
 
 def report_text(report: CostReport, paths: list[Path]) -> str:
-    """The conclusion, the table of advice, what was left out, and where the report is."""
+    """The table of advice, the conclusion, what was left out, and where the report is."""
     from fhash_codec.cost.results import ADVICE, advice_rows, conclusion, feature_options
 
-    lines = [*textwrap.wrap(conclusion(report), 100), ""]
+    lines = []
     if report.advice:
         lines += table([ADVICE, *advice_rows(report)], left=True).splitlines()
         lines += [f"each with {option}" for option in feature_options(report)]
+    lines += ["", *textwrap.wrap(conclusion(report), 100)]
     late = sum(entry.late for entry in report.left_out)
     if late:
         lines += ["", f"no time was left for {late} measurements; the page lists them as left out"]

@@ -34,8 +34,10 @@ from fhash_cli.output import (
     duration,
     emit,
     extent,
+    factor,
     loss_rows,
     model_name,
+    number,
     one_line,
     quality_rows,
     say,
@@ -46,6 +48,7 @@ from fhash_cli.output import (
 )
 from fhash_cli.variables import config_of, configs_of, report_table, variables_to_encode
 from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
+from fhash_formats.support.files import file_name
 
 if TYPE_CHECKING:
     from fhash_codec.comparison import EncodeReport
@@ -63,7 +66,6 @@ class EncodeOptions:
     """Options of `fhash encode` besides its data, output and settings."""
 
     components: str | None
-    explain: bool
     time_budget: float | None
     part: str | None
     plan: str | None
@@ -88,7 +90,11 @@ class Chosen(TypedDict, total=False):
 )
 @click.argument("data", type=click.Path())
 @click.option(
-    "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
+    "-o",
+    "output",
+    metavar="RUN.fhz",
+    type=click.Path(),
+    help="Where to write.  [default: DATA.fhz in this folder]",
 )
 @series_options
 @setting_options(by_variable=True)
@@ -101,9 +107,6 @@ class Chosen(TypedDict, total=False):
 @force_option
 @json_option
 @quiet_option
-@click.option(
-    "--explain", is_flag=True, help="Say how long each stage took, and why it ran or did not."
-)
 @click.option(
     "--time-budget",
     type=DURATION,
@@ -125,7 +128,12 @@ class Chosen(TypedDict, total=False):
     help="With --part: the plan that `fhash plan` made, settings included. Only the steps of the "
     "part are then read.",
 )
-@click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
+@click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    help="Print all figures, how long each stage took, and why it ran or did not.",
+)
 @click.option(
     "--report",
     "report_folder",
@@ -136,7 +144,7 @@ class Chosen(TypedDict, total=False):
 @option_group(EncodeOptions, "options")
 def command(
     data: str,
-    output: str,
+    output: str | None,
     source: SourceOptions,
     settings: dict[str, Any],
     options: EncodeOptions,
@@ -155,18 +163,20 @@ def command(
     others the same command starts again.
     """
     time_budget, report_folder = options.time_budget, options.report_folder
-    explain, as_json, quiet = options.explain, options.as_json, options.quiet
-    others = explain or time_budget is not None or report_folder is not None
+    verbose, as_json, quiet = options.verbose, options.as_json, options.quiet
+    others = verbose or time_budget is not None or report_folder is not None
     wish = WishedPart.of(options.part, options.plan, with_others=others)
+    if output is None:
+        output = default_output(data)
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     several = variables_to_encode(source, data, options.components, quiet=quiet)
     if several is not None:
-        alone = (time_budget, report_folder, wish, options.verbose or None)
+        alone = (time_budget, report_folder, wish)
         if any(given is not None for given in alone):
-            raise click.UsageError("--time-budget, --report, --part and -v are for one variable")
+            raise click.UsageError("--time-budget, --report and --part are for one variable")
         encoded = _encode_several(data, output, several, settings, force, quiet)
-        return _emit_several(encoded, explain, as_json)
+        return _emit_several(encoded, verbose, as_json)
     config = config_of(settings)
     if report_folder is not None:
         check_report_folder(Path(report_folder), force, data)
@@ -191,20 +201,22 @@ def command(
             )
     if not quiet:
         _say_remarks(source, series, config, report, promise_kept=missed is None)
-    rows = report_rows(report, series.units, part=source.part, verbose=options.verbose)
+    text = summary(report, series.units)
+    if verbose:
+        text = table(report_rows(report, series.units, part=source.part))
     if report_folder is not None:
-        rows.append(("report", str(Path(report_folder) / "cost.html")))
-    text = table(rows) + _explained(report, explain)
+        text += f"\n{Path(report_folder) / 'cost.html'}"
+    text += _explained(report, verbose)
     chosen: Chosen = {}
     if choice is not None:
         chosen["time_budget"] = choice.to_dict()
     return emit({**report, **chosen}, text, as_json, missed or stopped)
 
 
-def _explained(figures: EncodeReport, explain: bool, title: str = "") -> str:
+def _explained(figures: EncodeReport, verbose: bool, title: str = "") -> str:
     """The table of the stages of a report, which keeps them only where they are asked for."""
     stages = figures.pop("stages", [])
-    if not explain:
+    if not verbose:
         return ""
     figures["stages"] = stages
     return f"\n\n{title}{stage_table(stages)}"
@@ -225,6 +237,11 @@ def _say_remarks(
         if value == value and value not in series.occurring:
             say(f"--missing {value:.9g}: {series.source} holds no such value")
     integers = (series.source_dtype or series.dtype).kind in "iu"
+    if report["bytes"] > report["raw_bytes"]:
+        say(
+            f"the file is larger than its {size(report['raw_bytes'])} of values; a looser promise"
+            " makes it smaller, and so may lossless codecs"
+        )
     few = report["data_range"] <= MAX_LABELS and report["max_abs_error"]
     if integers and few:
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
@@ -266,20 +283,17 @@ def _encode_several(
 
 
 def _emit_several(
-    encoded: tuple[DatasetReport, QualityError | None], explain: bool, as_json: bool
+    encoded: tuple[DatasetReport, QualityError | None], verbose: bool, as_json: bool
 ) -> None:
     """Print the figures of a file of several variables, and raise what it misses."""
     report, missed = encoded
     variables = report["variables"]
-    rows = [
-        ("written", str(report["path"])),
-        ("size", compared(report)),
-        split_row(report),
-        ("time", duration(report["seconds"])),
-    ]
-    text = f"{table(rows)}\n\n{table(report_table(variables))}"
+    text = f"{sizes_of(report)}  {duration(report['seconds'])}"
+    if verbose:
+        text += f"\n\n{table([('size', compared(report)), split_row(report)])}"
+    text += f"\n\n{table(report_table(variables))}"
     for name, figures in variables.items():
-        text += _explained(figures, explain, f"{one_line(name)}\n")
+        text += _explained(figures, verbose, f"{one_line(name)}\n")
     emit(report, text, as_json, missed)
 
 
@@ -366,13 +380,34 @@ def _after_interruption(output: str, before: tuple[int, int] | None) -> str:
     return f"interrupted; {left}, and the same command {again}"
 
 
-def report_rows(
-    report: EncodeReport, units: str, *, part: bool, verbose: bool
-) -> list[tuple[str, str]]:
-    """An encoding's report as a table.
+def default_output(data: str) -> str:
+    """RUN.fhz of DATA, in this folder; raises UsageError where DATA has no name for it."""
+    stem = Path(file_name(data)).stem.replace("*", "").replace("?", "").rstrip("_-. ")
+    if not stem:
+        raise click.UsageError("Missing option '-o'; DATA gives no name for RUN.fhz")
+    return f"{stem}.fhz"
+
+
+def summary(report: Mapping[str, Any], units: str) -> str:
+    """An encoding in one line: file, sizes, what it keeps, and the time that it took."""
+    if report["rmse"] == 0:
+        kept = "every value exact"
+    else:
+        worst = number(report["max_abs_error"], units, digits=2)
+        kept = f"{number(report['psnr'], 'dB', digits=3)}  max error {worst}"
+    return f"{sizes_of(report)}  {kept}  {duration(report['seconds'])}"
+
+
+def sizes_of(report: Mapping[str, Any]) -> str:
+    """A file, the bytes of its values, its own, and how often these fit into those."""
+    sizes = f"{size(report['raw_bytes'])} -> {size(report['bytes'])}"
+    return f"{one_line(str(report['path']))}  {sizes} ({factor(report['ratio'])})"
+
+
+def report_rows(report: EncodeReport, units: str, *, part: bool) -> list[tuple[str, str]]:
+    """An encoding's report as a table, with the size after each stage of the search.
 
     part: whether options chose a part of the source.
-    verbose: whether the table has the size after each stage of the search.
     """
     published = report["published"]
     size_of_model = (
@@ -384,7 +419,7 @@ def report_rows(
         ("written", str(report["path"])),
         ("size", compared(report, part=part)),
         split_row(report),
-        *(gain_rows(report) if verbose else ()),
+        *gain_rows(report),
         ("steps, z, y, x", extent(report["shape"])),
         *([("key frames", str(len(report["key_frames"])))] if published else []),
         (

@@ -151,7 +151,7 @@ class WishedPart(NamedTuple):
         if text is None and plan is not None:
             raise click.UsageError("--plan goes with --part")
         if text is not None and with_others:
-            raise click.UsageError("--part goes without --explain, --time-budget and --report")
+            raise click.UsageError("--part goes without -v, --time-budget and --report")
         return None if text is None else cls(text, plan)
 
 

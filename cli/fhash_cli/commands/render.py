@@ -14,16 +14,19 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NotRequired, Typed
 import click
 
 from fhash_cli.options import (
+    PLANE,
+    SIZE,
     SLICE,
     BaseCommand,
     Command,
     IntervalsType,
     RealRange,
-    TextType,
     check_writable,
     feature_option,
     force_option,
     json_option,
+    numbers_type,
+    opacity_type,
     option_group,
     quiet_option,
     run_argument,
@@ -41,73 +44,6 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.scenes import Scene
     from fhash_codec.rendering.tracking import Followed, Tracked
 
-NUMBERS = {2: "A,B", 3: "X,Y,Z"}
-"""Placeholders of options that take so many numbers."""
-
-
-def numbers_type(count: int) -> TextType:
-    """A fixed count of numbers with commas; the scene checks later whether they are allowed."""
-
-    def parsed(text: str) -> tuple[float, ...]:
-        try:
-            numbers = tuple(float(part) for part in text.split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != count:
-            raise ValueError(
-                f"'{text}' is not {count} numbers with commas between them,"
-                f" such as {','.join('123'[:count])}"
-            )
-        return numbers
-
-    return TextType(NUMBERS[count], parsed)
-
-
-def _size(text: str) -> tuple[int, int]:
-    across, _, down = text.lower().partition("x")
-    try:
-        return int(across), int(down or across)
-    except ValueError:
-        raise ValueError(f"'{text}' is not a size in pixels such as 800x600") from None
-
-
-SIZE = TextType("WxH", _size)
-"""Pixels across and down, or one number for both."""
-
-
-def opacity_type(*, named: bool = True) -> TextType:
-    """Points VALUE:OPACITY with commas between them, or (`named`) the name of a preset."""
-
-    def parsed(text: str) -> Any:
-        if named and ":" not in text:
-            return text
-        try:
-            return [[float(end) for end in part.split(":")] for part in text.split(",")]
-        except ValueError:
-            what = "neither the name of an opacity nor" if named else "not"
-            raise ValueError(f"'{text}' is {what} points such as 0:0,0.5:0.2,2:1") from None
-
-    return TextType("NAME|V:O,..." if named else "G:F,...", parsed)
-
-
-def _plane(text: str) -> dict[str, Any]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) == 4:
-        return {"normal": numbers[:3], "offset": numbers[3]}
-    if len(numbers) == 6:
-        return {"point": numbers[:3], "normal": numbers[3:]}
-    raise ValueError(
-        f"'{text}' is neither a normal and an offset, NX,NY,NZ,D, nor a point and a normal,"
-        " X,Y,Z,NX,NY,NZ, such as 0,0,1,0.5"
-    )
-
-
-PLANE = TextType("NX,NY,NZ,D", _plane)
-"""Settings of a ClipPlane: its normal and an offset, or a point of it and its normal."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
@@ -117,6 +53,7 @@ class SceneOptions:
         file: path of a scene to begin from, or None.
         places: places of the scene, such as `camera.view`, with their values.
         effects: names of effects to switch on.
+        bare: whether only these are on, and not the usual ones as well.
         isosurfaces: texts VALUE[,COLOUR][,OPACITY].
         settings: texts PLACE=VALUE.
     """
@@ -124,14 +61,17 @@ class SceneOptions:
     file: str | None
     places: dict[str, Any]
     effects: tuple[str, ...]
+    bare: bool = False
     isosurfaces: tuple[str, ...]
     settings: tuple[str, ...]
 
     def scene(self, volume: Volume) -> Scene:
         """The scene; raises InputError for what it may not hold."""
-        from fhash_codec.rendering.scenes import Scene
+        from fhash_codec.rendering.scenes import USUAL_EFFECTS, Scene
 
         base = Scene() if self.file is None else Scene.load(self.file)
+        if self.file is None and not self.bare:
+            base = dataclasses.replace(base, effects=USUAL_EFFECTS)
         values = base.to_dict()
         if "step" in self.places or "time" in self.places:
             for name in ("step", "time", "evolution"):
@@ -140,8 +80,10 @@ class SceneOptions:
             _put(values, place, value)
         if values.get("step") is not None and float(values["step"]) < 0:
             values["step"] += volume.shape[0]
-        for name in self.effects:
-            _put(values, f"effects.{_effect(name)}", True)
+        for name in map(_effect, self.effects):
+            _put(values, f"effects.{name}", True)
+            if name.endswith("intensity") and self.file is None and "shading" not in self.effects:
+                values["effects"].pop("shading", None)  # light on no surface
         if self.isosurfaces:
             _put(values, "effects.isosurfaces", [_isosurface(text) for text in self.isosurfaces])
         for setting in self.settings:
@@ -222,8 +164,8 @@ SETTINGS = (
             " five steps the one of most structure"),
     Setting("--time", "time", "T", click.STRING, "a time instead of a step: a number, or a date"
             " such as 2001-02-10T06:00"),
-    Setting("--size", "size", kind=SIZE, help="pixels across and down.  [default: 512x512,"
-            " a map as its shape is]"),
+    Setting("--size", "size", kind=SIZE, help="pixels across and down.  [default: 1024x1024,"
+            " a map as its shape is; 512x512 for each step of an evolution]"),
     Setting("--view", "camera.view", "NAME"),
     Setting("--azimuth", "camera.azimuth", "DEGREES"),
     Setting("--elevation", "camera.elevation", "DEGREES"),
@@ -273,9 +215,14 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         "effects",
         metavar="NAME",
         multiple=True,
-        help="shading, shadows, ambient-occlusion, maximum-intensity, minimum-intensity,"
-        " average-intensity, attenuated-maximum-intensity, jitter, box, axes, colour-bar or"
-        " time-label; may be repeated.",
+        help="shadows, ambient-occlusion, maximum-intensity, minimum-intensity,"
+        " average-intensity, attenuated-maximum-intensity or jitter, beside shading, box, axes,"
+        " colour-bar and time-label, which are on; may be repeated.",
+    ),
+    click.option(
+        "--bare",
+        is_flag=True,
+        help="No shading, box, axes, colour bar and time but those of --effect.",
     ),
     click.option(
         "--isosurface",
@@ -401,6 +348,8 @@ def _json(text: str) -> Any:
         return text
 
 
+PANEL = (512, 512)
+"""Pixels of each step of an evolution, unless more are asked for."""
 OWN = "own"
 """Value of `--track` that stands for the features of the file."""
 
@@ -439,7 +388,11 @@ class AnimationOptions:
             return scene
         steps = tuple(map(float, steps_of(volume, self.evolution, "--evolution")))
         return dataclasses.replace(
-            scene, step=None, time=None, evolution=Evolution(steps=steps, columns=self.columns)
+            scene,
+            step=None,
+            time=None,
+            size=PANEL if scene.size == type(scene)().size else scene.size,
+            evolution=Evolution(steps=steps, columns=self.columns),
         )
 
 

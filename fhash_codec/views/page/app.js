@@ -20,11 +20,12 @@ const GLANCE = 2 ** 15;
 const MOST_COUNTED = 16 * 2 ** 20; // bytes of files of which more is read than what is shown
 const MOST_PIXELS = 2 ** 22;
 const BAND_MS = 40;
+const EARLY_MS = 400; // after which slices stand for a volume of which there is no picture yet
 
 export const element = (id) => document.getElementById(id);
 
 export const app = {
-  container: null, number: 0, step: 0, playing: false, mode: "volume", scene: {}, frame: null, grid: null, tf: null, counts: null,
+  container: null, number: 0, step: 0, playing: false, mode: "volume", early: false, drawn: false, scene: {}, frame: null, grid: null, tf: null, counts: null,
   features: [], marcher: null, scale: 0.5, fps: 0, moving: 0, wanted: 0, fixedSize: null,
 };
 
@@ -56,7 +57,7 @@ export function background() {
 /** Open a container: `{url}` or `{blob}`, with a name; `state` is what a link said. */
 export async function open(source, name, state = {}) {
   app.container?.close();
-  Object.assign(app, { container: null, frame: null, tf: null, counts: null, playing: false, step: 0, number: 0, scene: {}, name });
+  Object.assign(app, { container: null, frame: null, tf: null, counts: null, early: false, drawn: false, playing: false, step: 0, number: 0, scene: {}, name });
   say("");
   element("busy").hidden = false;
   const made = new Container(source, { wasm, changed: status });
@@ -94,6 +95,8 @@ export async function choose(number, scene, state = {}) {
   if (state.mode) setMode(state.mode);
   slices.place = state.place ?? null;
   panel.fill();
+  clearTimeout(choose.late);
+  if (!state.mode) choose.late = setTimeout(() => setEarly(true), EARLY_MS);
   await show();
   if (scene.step == null && scene.time == null) await fullest();
 }
@@ -117,7 +120,7 @@ export function setScene(scene) {
   app.scene = scene;
   const wanted = (scene.features ?? []).filter((text) => about.features.includes(text));
   app.features = wanted.length ? wanted : [...about.features];
-  if (!scene.effects) app.scene.effects = { box: true, axes: true, colour_bar: true, time_label: last > 0 };
+  if (!scene.effects) app.scene.effects = { shading: { ambient: 0.5, diffuse: 0.6 }, box: true, axes: true, colour_bar: true, time_label: last > 0 };
   app.grid = gridOf([3, 2, 1].map((axis) => about.coords[axis]), scene.scale ?? undefined);
   app.marcher?.setPlaces(app.grid.places);
   let step = scene.step ?? 0;
@@ -146,8 +149,8 @@ function levels() {
 
 /** Count the values of the first, middle and last step, as `fhash render` does where it chooses the opacity. */
 async function count() {
-  const { number, container } = app, about = variable(), { box } = about, last = about.shape[0] - 1, opacity = app.scene.transfer_function?.opacity ?? "auto";
-  if (app.counts.whole || !["auto", "feature"].includes(opacity) || about.features.length || container.about.size > MOST_COUNTED) return;
+  const { number, container } = app, about = variable(), { box } = about, last = about.shape[0] - 1, { opacity = "auto", range } = app.scene.transfer_function ?? {};
+  if (app.counts.whole || (range && !["auto", "feature"].includes(opacity)) || about.features.length || container.about.size > MOST_COUNTED) return;
   app.counts.whole = true;
   let lod = 0;
   while (lod < about.levels && ((box[1] - box[0]) * (box[3] - box[2]) * (box[5] - box[4])) / 8 ** lod > COUNTED) lod++;
@@ -186,7 +189,7 @@ export async function show() {
     app.playing = false;
     say(`${app.name}: ${error.message}`, true);
   }
-  element("busy").hidden = true;
+  element("busy").hidden = !app.early;
   panel.time();
 }
 
@@ -197,7 +200,7 @@ function next(n) {
   return step <= last ? step : step - last - (stride === 1 ? 1 : 0) < 0 ? 0 : Math.min(step - last - (stride === 1 ? 1 : 0), last);
 }
 
-const smoothing = () => (app.tf && app.mode === "volume" && app.marcher ? smoothingOf(app.scene, app.grid, variable(), app.tf).deviation : 0);
+const smoothing = () => (app.tf && (app.mode === "volume" || app.early) && app.marcher ? smoothingOf(app.scene, app.grid, variable(), app.tf).deviation : 0);
 
 /** Draw a frame from now on. */
 function take(frame) {
@@ -236,16 +239,15 @@ function tick() {
   if (!app.frame) return;
   if (app.mode === "slices") {
     if (app.dirty) slices.show({ frame: app.frame, grid: app.grid, coords: spatial(), tf: app.tf, units: variable().units, background: parseColour(background()) });
-    app.dirty = false;
     status();
-    return;
+    if (!app.early) app.dirty = false;
   }
-  if (!app.marcher || app.marcher.lost) return;
+  if (!app.marcher || app.marcher.lost || (app.mode === "slices" && !app.early)) return;
   const again = () => { app.ticking = requestAnimationFrame(tick); };
   if (app.marcher.busy()) return again(); // one picture at a time, or they would pile up
   app.measured?.(performance.now() - app.submitted);
   app.measured = null;
-  const still = performance.now() - app.moving > 150 && !app.playing;
+  const still = performance.now() - app.moving > 150 && !app.playing && !app.early;
   if (app.dirty) {
     surround();
     if (!still) quick();
@@ -322,6 +324,7 @@ function quick() {
   app.marcher.show();
   submitted(begin, (ms) => {
     app.fps = 1000 / ms;
+    there();
     app.scale = Math.min(Math.max(app.scale * Math.sqrt(Math.min(Math.max(50 / ms, 0.4), 1.3)), 0.25), 1);
   });
 }
@@ -340,6 +343,7 @@ function* refinement() {
   sized(app.marcher.canvas, size);
   app.marcher.show();
   app.sharp = true;
+  there();
   document.documentElement.dataset.drawn = Number(document.documentElement.dataset.drawn ?? 0) + 1;
 }
 
@@ -356,8 +360,28 @@ export function status() {
 /** A number of bytes as people write it. */
 export const bytes = (n) => (n < 1e4 ? `${n} B` : n < 1e7 ? `${(n / 1e3).toFixed(0)} kB` : `${(n / 1e6).toFixed(1)} MB`);
 
+/** Show slices until there is a picture of the volume, or show the volume. */
+function setEarly(on) {
+  if (on && (app.drawn || !app.marcher || app.mode !== "volume")) return;
+  if (on && !app.frame) { // nothing is decoded yet
+    choose.late = setTimeout(() => setEarly(true), EARLY_MS);
+    return;
+  }
+  setMode(on ? "slices" : "volume");
+  app.early = on;
+  if (on && app.container) Object.assign(element("busy"), { textContent: "drawing the volume", hidden: false });
+  else Object.assign(element("busy"), { textContent: "decoding", hidden: true });
+}
+
+/** There is a picture of the volume. */
+function there() {
+  app.drawn = true;
+  if (app.early) setEarly(false);
+}
+
 /** Show the volume or the slices. */
 export function setMode(mode) {
+  app.early = false;
   app.mode = app.marcher ? mode : "slices";
   for (const id of ["behind", "volume", "before"]) element(id).hidden = app.mode === "slices";
   element("slices").hidden = app.mode !== "slices";

@@ -125,6 +125,18 @@ function bar(context, { tf, quantity, ink, size }) {
     context.fillStyle = colourCode(colourAt(tf.colours, high - ((row + 0.5) / tall) * (high - low)));
     context.fillRect(left, top + row, thick, 1);
   }
+  for (const [there, tip, value] of [[tf.all[1] > high, top - 1, high], [tf.all[0] < low, top + tall + 1, low]]) {
+    if (!there) continue; // values beyond the colours
+    context.beginPath();
+    context.moveTo(left - 1, tip);
+    context.lineTo(left + thick + 1, tip);
+    context.lineTo(left + thick / 2, tip + (value === high ? -thick / 2 : thick / 2));
+    context.closePath();
+    context.fillStyle = colourCode(colourAt(tf.colours, value));
+    context.strokeStyle = ink[0];
+    context.fill();
+    context.stroke();
+  }
   for (const [value, text] of marks) {
     const y = top + tall * (1 - (value - low) / (high - low || 1));
     context.fillStyle = ink[0];

@@ -10,6 +10,8 @@ const EDGE = 0.1;
 const TENT = 0.02;
 const THIN = 8;
 const OPAQUE = 64;
+const VISIBLE = 0.02;
+const CUT = 0.05;
 
 /** Value at `at` of a piecewise linear curve of points [at, value]; beyond the ends that of the end. */
 export function interpolate(points, at) {
@@ -51,6 +53,20 @@ export function shownRange(features, range) {
     range = [Math.min(...ranges.map((one) => one[0])), Math.max(...ranges.map((one) => one[1]))];
   }
   return range[0] < range[1] ? range : [range[0], range[0] + Math.max(Math.abs(range[0]) * 1e-6, 1e-30)];
+}
+
+/** Values that colours reach over by what is visible (visible_range there). points: null where all count alike. */
+export function visibleRange(counts, points, [low, high]) {
+  const width = (high - low) / counts.length;
+  const seen = counts.map((one, n) => one * (points ? interpolate(points, low + (n + 0.5) * width) : 1));
+  const weights = seen.some((one) => one > 0) ? seen : counts, total = weights.reduce((sum, one) => sum + one, 0);
+  if (!total || !(low < high)) return [low, high];
+  const shares = [];
+  let sum = 0;
+  for (const one of weights) shares.push((sum += one) / total);
+  const first = shares.findIndex((one) => one >= VISIBLE), last = shares.findIndex((one) => one >= 1 - VISIBLE);
+  const ends = [low + first * width, low + ((last < 0 ? counts.length - 1 : last) + 1) * width];
+  return [ends[0] - low > CUT * (high - low) ? ends[0] : low, high - ends[1] > CUT * (high - low) ? ends[1] : high];
 }
 
 const tent = (value, range) => {
@@ -141,12 +157,14 @@ export const extinctionOf = (opacity, distance) => Math.min(-Math.log1p(-opacity
 
 /** The transfer function of a scene: colours, points, and what `table` needs. */
 export function transferFunction(spec, about) {
-  const shown = spec.range ?? shownRange(about.features, about.range);
+  const thin = spec.unit_distance ? [Infinity, Infinity] : about.thin, opacity = spec.opacity ?? "auto";
+  const over = (shown) => (spec.nothing ? [[about.range[0], 0]] : Array.isArray(opacity) ? opacity : opacityPoints(opacity, { ...about, shown, thin }));
+  let shown = spec.range ?? shownRange(about.features, about.range), points = over(shown);
+  if (!spec.range && shown[0] === about.range[0] && shown[1] === about.range[1]) {
+    shown = visibleRange(about.counts, Array.isArray(opacity) || ["auto", "feature"].includes(opacity) ? points : null, about.range);
+    points = over(shown);
+  }
   const colours = colourMap(spec.colours ?? "viridis", shown);
-  const thin = spec.unit_distance ? [Infinity, Infinity] : about.thin;
-  const points = spec.nothing ? [[about.range[0], 0]]
-    : Array.isArray(spec.opacity) ? spec.opacity
-    : opacityPoints(spec.opacity ?? "auto", { ...about, shown, thin });
   let [low, high] = about.range;
   const positive = points.flatMap((point, n) => (point[1] > 0 ? [n] : []));
   if (positive.length) {
@@ -155,7 +173,7 @@ export function transferFunction(spec, about) {
     high = Math.min(high, last + 1 < points.length ? points[last + 1][0] : Math.max(points.at(-1)[0], ends[1]));
   }
   if (!(low < high)) [low, high] = [Math.min(low, high), Math.min(low, high) + Math.max(Math.abs(low) * 1e-6, 1e-30)];
-  return { shown, colours, points, span: [low, high], density: spec.density ?? 1, distance: spec.unit_distance ?? about.spacing };
+  return { shown, all: about.range, colours, points, span: [low, high], density: spec.density ?? 1, distance: spec.unit_distance ?? about.spacing };
 }
 
 /** Colours and opacities of one step of `length`, RGBA float32, at n values spread over the span. */

@@ -308,6 +308,18 @@ def find_reader(path: Path, request: Request) -> Reader:
     raise InputError(f"{path} is of no format that can be read{_advice(path)}")
 
 
+def recognised(path: str | Path) -> str | None:
+    """The format of a file of data by its first bytes; None for another, and for no file."""
+    try:
+        with Path(path).open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        return None
+    if not head or head.startswith(zarr_store.ZIP):
+        return None
+    return next((each.name for each in REGISTRY if each.matches(head, Path(path))), None)
+
+
 ELSEWHERE = {
     "ParaView, with the filter ResampleToImage": ".vtu .vts .pvtu .pvts .vtp .vtm .foam .case"
     " .e .exo .cgns .xmf .xdmf .plt .silo .msh .stl .ply .obj",
@@ -332,7 +344,7 @@ def _advice(path: Path) -> str:
             return (
                 f"; read it by {way}, and give the array or the xarray object to fhash_codec.encode"
             )
-    return f": {', '.join(str(reader) for reader in REGISTRY)}"
+    return f": {', '.join(dict.fromkeys(reader.name for reader in REGISTRY))}"
 
 
 def _head(path: Path) -> bytes:

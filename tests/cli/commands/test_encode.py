@@ -33,7 +33,8 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
     for gain in report["gains"]:
         assert sum(line.startswith(f"  {gain['what']}  ") for line in lines) == 1
         assert not any(line.startswith(f"  {gain['what']}  ") for line in brief)
-    assert not any("key frames" in line or "epochs" in line for line in lines)
+    assert brief[0].startswith(f"{tmp_path / 'run.fhz'}  ")
+    assert len(brief) == 1
     bare = json.loads(fhash(*words, "--json").stdout)
     assert bare["gains"] == []
     assert fhash(*words, "-v").exit_code == 0
@@ -183,7 +184,7 @@ def test_explain_says_what_took_the_time_and_what_was_left_out(
         "--train",
         "none",
     )
-    result = fhash(*words, "--explain")
+    result = fhash(*words, "-v")
     assert (result.exit_code, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
     assert any(line.split() == ["stage", "seconds", "share", "why"] for line in lines)
@@ -278,7 +279,7 @@ def test_wrong_sets_of_parts_are_refused(
     assert "allowed: I/N" in refused(2, *other, "--max-error", "1", "--part", "half")
     assert "allowed: 1/3 to 3/3" in refused(2, *other, "--max-error", "1", "--part", "4/3")
     assert "4 parts of 3 layers" in refused(2, *other, "--max-error", "1", "--part", "1/4")
-    assert "--part goes without" in refused(2, *other, "--part", "1/3", "--explain")
+    assert "--part goes without" in refused(2, *other, "--part", "1/3", "-v")
 
 
 BOUNDED_APPEND = ["--max-error", "0.01", "--tile", "2x6x7x8", "--effort", "1", "-q"]
@@ -321,3 +322,38 @@ def test_unsuitable_files_are_refused(
         2, "append", halves[0], run.with_name("other.npy"), "-q"
     )
     assert "no such file" in refused(2, "append", run.with_name("none.fhz"), more, "-q")
+
+
+def test_without_a_name_the_file_is_named_after_its_data(
+    fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert fhash("encode", data, *SMALL).exit_code == 0
+    assert (tmp_path / f"{data.stem}.fhz").exists()
+    assert "exists" in fhash("encode", data, *SMALL).stderr
+
+
+def test_a_share_of_the_range_may_be_in_percent(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ["encode", data, "-o", tmp_path / "a.fhz", *SMALL]
+    assert fhash(*words, "--max-error-rel", "2%").exit_code == 0
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume.info["config"]["max_error_rel"] == 0.02
+    result = fhash(*words, "--max-error", "2%", "--force")
+    assert result.exit_code == 2
+    assert "--max-error-rel is a share" in result.stderr
+
+
+def test_data_in_place_of_a_container_are_no_damage(fhash: Fhash, data: Path) -> None:
+    for command in ("decode", "render", "verify"):
+        result = fhash(command, data)
+        assert result.exit_code == 2
+        assert "HDF5 data, no container; encode it first: fhash encode" in result.stderr
+
+
+def test_two_containers_are_compared(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    for name, psnr in (("a", "30"), ("b", "60")):
+        fhash("encode", data, "-o", tmp_path / f"{name}.fhz", "--psnr", psnr, *SMALL)
+    report = json.loads(fhash("diff", tmp_path / "a.fhz", tmp_path / "b.fhz", "--json").stdout)
+    with fhash_codec.open(tmp_path / "a.fhz") as one, fhash_codec.open(tmp_path / "b.fhz") as other:
+        error = float(np.abs(one[...].astype(float) - other[...].astype(float)).max())
+    assert report["max_abs_error"] == pytest.approx(error)

@@ -121,7 +121,9 @@ def test_clips_and_gradients_are_put_where_a_scene_has_them() -> None:
         found.append(options.scene(VOLUME))
 
     def parsed(*words: str) -> dict[str, object]:
-        done = CliRunner().invoke(command, words, standalone_mode=False, catch_exceptions=False)
+        done = CliRunner().invoke(
+            command, ["--bare", *words], standalone_mode=False, catch_exceptions=False
+        )
         assert done.exit_code == 0
         return found[-1].to_dict()
 
@@ -269,7 +271,7 @@ def test_explain_says_what_is_done_and_what_it_took(
     fhash: Fhash, run: Path, tmp_path: Path
 ) -> None:
     view = tmp_path / "v.png"
-    result = fhash("render", run, "-o", view, "--explain", "--size", "24")
+    result = fhash("render", run, "-o", view, "--bare", "--explain", "--size", "24")
     assert result.exit_code == 0
     assert "none: no effect asks for it" in result.stdout
     assert "evaluations" in result.stdout

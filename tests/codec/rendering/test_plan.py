@@ -93,7 +93,8 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
 
     for name, scene, expected in (
         ("compact", {}, 1),
-        ("compact", {"transfer_function": {"opacity": "linear"}}, 0),
+        ("compact", {"transfer_function": {"opacity": "linear"}}, 1),
+        ("compact", {"transfer_function": {"opacity": "linear", "range": [0, 1]}}, 0),
         ("feature", {}, 0),
     ):
         with fhash_codec.open(files[name]) as opened:

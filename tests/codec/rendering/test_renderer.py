@@ -29,7 +29,6 @@ from fhash_codec.rendering.layout import (
     TITLE_GAP,
     Layout,
     drawable,
-    end_texts,
     lay_out,
     length,
     line_height,
@@ -41,7 +40,14 @@ from fhash_codec.rendering.layout import (
 )
 from fhash_codec.rendering.march_task import Units
 from fhash_codec.rendering.renderer import evolution
-from fhash_codec.rendering.scenes import Camera, Effects, Evolution, LegendEntry, scene_in_png
+from fhash_codec.rendering.scenes import (
+    USUAL_EFFECTS,
+    Camera,
+    Effects,
+    Evolution,
+    LegendEntry,
+    scene_in_png,
+)
 from fhash_codec.rendering.view import edges
 from fhash_formats.errors import InputError, OutputExistsError
 from fhash_formats.series import Coordinate
@@ -63,7 +69,7 @@ def test_without_a_scene_the_default_is_rendered(volume: Volume) -> None:
     image = render(volume, progress=lambda stage, *_: stages.append(stage))
     assert image.rgba.shape == (*Scene().size[::-1], 4)
     step = image.scene["step"]
-    assert dict(image.scene) == Scene(step=step).to_dict()
+    assert dict(image.scene) == Scene(step=step, effects=USUAL_EFFECTS).to_dict()
     assert set(stages) == {"decoding", "marching"}
 
 
@@ -581,39 +587,19 @@ def test_ticks_lie_within_the_ends_at_any_scale(scale: float, count: int) -> Non
         )
 
 
-@pytest.mark.parametrize(
-    ("first", "last", "texts"),
-    [
-        (0, 4, ("0", "4")),
-        (88, -88, ("88", "-88")),
-        (5, 5000, ("5", "5000")),
-        (1234567.125, 1234890.5, ("1234567.1", "1234890.5")),
-        (0.001, 0.0025, ("0.001", "0.0025")),
-        (0.1 + 0.2, 1, ("0.3", "1")),
-        (3, 3, ("3", "3")),
-        (-0.00001, 1, ("0", "1")),
-        (1e12, 1.0001e12, ("1e+12", "1.0001e+12")),
-        (0, 3e-9, ("0", "3e-09")),
-    ],
-)
-def test_ends_are_told_apart_in_few_letters(
-    first: float, last: float, texts: tuple[str, str]
-) -> None:
-    assert end_texts(first, last) == texts
-
-
-def test_ends_that_are_out_of_view_have_no_number() -> None:
+def test_ticks_that_are_out_of_view_have_no_number() -> None:
     grid, view = Grid.of(COORDS), (0.0, 0.0, 400.0, 400.0)
     near = Rays.of(Camera(view="xz", zoom=3), grid, (400, 400))
-    labels, _ = scales(near, view, view, COORDS, 12, breaking=0)
+    labels, marks, _ = scales(near, view, view, COORDS, 12, breaking=0)
     assert not labels
+    assert not marks
     beside = Rays.of(
         Camera(view="xz", zoom=3, focal_point=(0.0, 1.5, 0.0), position=(0.0, -15.0, 0.0)),
         grid,
         (400, 400),
     )
     texts = [label.lines[0] for label in scales(beside, view, view, COORDS, 12, breaking=0)[0]]
-    assert sorted(texts) == ["0", "0", "x [km]", "z [km]"]
+    assert sorted(texts) == ["0", "0.0", "0.5", "1", "1.0", "x [km]", "z [km]"]
 
 
 SIZES_LAYOUT = [(256, 256), (512, 512), (1024, 1024), (480, 270), (270, 480), (256, 700)]

@@ -253,15 +253,15 @@ def test_an_axis_in_other_units_is_no_thinner_than_a_quarter() -> None:
 @pytest.mark.parametrize(
     ("axes", "view", "size"),
     [
-        ({}, "iso", (512, 512)),
-        ({"z": [0]}, "xy", (512, 512)),
-        ({"z": [0], "y": range(3)}, "xy", (512, 128)),
-        ({"z": [0], "y": range(6)}, "xy", (512, 256)),
-        ({"x": [0], "y": range(6)}, "yz", (256, 512)),
-        ({"z": [0], "y": [0]}, "xy", (512, 512)),
-        ({"z": [0, 0.6]}, "xy", (512, 512)),
-        ({"y": [0, 0.3, 0.6]}, "xz", (512, 512)),
-        ({"y": [0, 0.3, 0.7]}, "iso", (512, 512)),
+        ({}, "iso", (1024, 1024)),
+        ({"z": [0]}, "xy", (1024, 1024)),
+        ({"z": [0], "y": range(3)}, "xy", (1024, 204)),
+        ({"z": [0], "y": range(6)}, "xy", (1024, 512)),
+        ({"x": [0], "y": range(6)}, "yz", (512, 1024)),
+        ({"z": [0], "y": [0]}, "xy", (1024, 1024)),
+        ({"z": [0, 0.6]}, "xy", (1024, 1024)),
+        ({"y": [0, 0.3, 0.6]}, "xz", (1024, 1024)),
+        ({"y": [0, 0.3, 0.7]}, "iso", (1024, 1024)),
     ],
 )
 def test_a_plane_or_a_thin_volume_is_seen_from_above(
@@ -270,7 +270,7 @@ def test_a_plane_or_a_thin_volume_is_seen_from_above(
     where = grid(**axes)
     assert view_of("auto", where) == view
     assert usual_size(Camera(), where) == size
-    assert usual_size(Camera(view="iso"), where) == (512, 512)
+    assert usual_size(Camera(view="iso"), where) == (1024, 1024)
     if view != "iso":
         origins, directions = Rays.of(Camera(projection="parallel"), where, (8, 8)).pixels()
         assert np.count_nonzero(directions[0, 0]) == 1

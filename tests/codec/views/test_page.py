@@ -535,6 +535,7 @@ def scenes(low: float, high: float) -> dict[str, tuple[float, dict[str, Any]]]:
     base = {
         "camera": {"azimuth": 20, "elevation": 10},
         "size": [192, 160],
+        "step": 0,
         "march": {"lod": 0},
         "effects": {},
     }
