@@ -12,7 +12,7 @@ QUICK := $(SPREAD) --assert=plain
 # Programs that tests start would else compile all that they import.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types units torch vtk clang docs site heavy notebooks hard every results device lib paraview compile-times lowest newest wheels \
+.PHONY: demo test types units torch vtk clang docs site heavy pictures notebooks hard every results device lib paraview compile-times lowest newest wheels \
 	wasm view clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
@@ -47,6 +47,10 @@ site: .venv/.docs .venv/.torch .venv/.vtk
 # The tests of docs and vtk in one run, which collects once.
 heavy: .venv/.docs .venv/.torch .venv/.vtk
 	$(BIN)/python -m pytest $(QUICK) -m '(docs or vtk) and not every'
+
+# The pictures of the pages anew, from a file of real data: make pictures DATA=isabel.h5 (the tables: make results).
+pictures: .venv/.stamp
+	$(BIN)/python docs/make_pictures.py $(DATA)
 
 # The notebooks of the documentation with their outputs.
 notebooks: .venv/.docs

@@ -149,58 +149,49 @@ GALLERY_SERIES = {
 }
 """Series of the gallery by name."""
 
-AROUND = "--effect box --effect axes --effect colour-bar --effect time-label"
-"""Options of everything that may stand around a volume."""
-
 PICTURES = (
     Picture(
         name="plane",
-        title="A field of one level is drawn as an opaque plane, seen from above; land is left out",
+        title="Sea surface temperature: a plane from above",
         series="sea",
-        options=_words(f"--size 640x360 --cmap turbo {AROUND}"),
+        options=_words("--size 960x540 --cmap turbo"),
     ),
     Picture(
         name="depth",
-        title="Depths go downwards, and uneven ones are drawn where they lie",
+        title="Ocean temperature at uneven depths",
         series="ocean",
-        options=_words(
-            f"--size 560x420 --cmap turbo --opacity 2:0.02,6:0.12,30:0.25 --azimuth -75 {AROUND}"
-        ),
+        options=_words("--size 800x600 --cmap turbo --opacity 2:0.02,6:0.12,30:0.25 --azimuth -75"),
     ),
     Picture(
         name="pressure",
-        title="Jet streams at uneven pressure levels, as an isosurface",
+        title="Isosurfaces of jet streams at uneven pressure levels",
         series="jet",
         options=_words(
-            "--size 560x420 --no-volume --isosurface 50,#d95f02 --isosurface 30,#3182bd,0.4"
-            " --scale 1,1,0.1 --azimuth -75 --antialiasing 2 --effect box --effect axes"
-            " --effect time-label"
+            "--size 800x600 --no-volume --isosurface 50,#d95f02 --isosurface 30,#3182bd,0.4"
+            " --scale 1,1,0.1 --azimuth -75 --antialiasing 2"
         ),
     ),
     Picture(
         name="shaded",
-        title="A volume with a bound, shaded, with shadows",
+        title="Blast wave with shadows",
         series="blast",
-        options=_words(
-            "--size 420x420 --t 8 --cmap plasma --density 2 --effect shading --effect shadows"
-            " --effect box --effect colour-bar"
-        ),
+        options=_words("--size 800x800 --t 8 --cmap plasma --density 2 --effect shadows"),
     ),
     Picture(
         name="surface",
-        title="Isosurfaces, one of them transparent, on a dark ground",
+        title="Transparent isosurface on a dark background",
         series="blast",
         options=_words(
-            "--size 420x420 --t 6 --no-volume --isosurface 0.35,#e6550d"
-            " --isosurface 0.24,#9ecae1,0.35 --antialiasing 2 --background #101520 --effect box"
+            "--size 800x800 --t 6 --no-volume --isosurface 0.35,#e6550d"
+            " --isosurface 0.24,#9ecae1,0.35 --antialiasing 2 --background #101520"
         ),
     ),
     Picture(
         name="track",
-        title="Features in their colours, over several steps",
+        title="Tracked features over several steps",
         series="blast",
         options=_words(
-            "--size 220x200 --evolution 1:12:3 --columns 4 --track interval:0.25:0.35"
+            "--size 320x300 --evolution 1:12:3 --columns 4 --track interval:0.25:0.35"
             " --track isosurface:0.4"
         ),
     ),

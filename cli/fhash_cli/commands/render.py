@@ -86,6 +86,11 @@ class SceneOptions:
                 values["effects"].pop("shading", None)  # light on no surface
         if self.isosurfaces:
             _put(values, "effects.isosurfaces", [_isosurface(text) for text in self.isosurfaces])
+        surfaces = values.get("effects", {}).get("isosurfaces", ())
+        alone = values.get("transfer_function", {}).get("nothing")
+        usual = self.file is None and "colour-bar" not in self.effects
+        if alone and usual and all("colour" in each for each in surfaces):
+            values["effects"].pop("colour_bar", None)  # nothing has its colours
         for setting in self.settings:
             place, equals, text = setting.partition("=")
             if not equals:
