@@ -175,7 +175,7 @@ PICTURES = (
         name="shaded",
         title="Blast wave with shadows",
         series="blast",
-        options=_words("--size 800x800 --t 8 --cmap plasma --density 2 --effect shadows"),
+        options=_words("--size 760x760 --t 8 --cmap plasma --density 2 --effect shadows"),
     ),
     Picture(
         name="surface",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from fhash_bench.commands.mine import mine
 from fhash_bench.commands.paper import paper
 from fhash_bench.commands.rate import kinds, labels, rate, rate_table
 from fhash_bench.commands.render import render
@@ -16,5 +17,5 @@ def command() -> None:
     """Measure speed and size on this machine."""
 
 
-for _bench in (ablate, kinds, labels, paper, rate, render, rate_table, train):
+for _bench in (ablate, kinds, labels, mine, paper, rate, render, rate_table, train):
     command.add_command(_bench)

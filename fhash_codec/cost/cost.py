@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import DEFAULT_PSNR, EncodeConfig
 from fhash_codec.cost.encodings import ONE_SHARE, KeptFile, OwnEncodings, encoded_of
 from fhash_codec.cost.peers import PeerEncodings
 from fhash_codec.cost.plan import (
@@ -19,16 +18,15 @@ from fhash_codec.cost.plan import (
     PEERS,
     Allowance,
     Facts,
-    cropped,
     described,
     facts_of,
     options_of,
     wishes,
 )
-from fhash_codec.cost.prediction import Predictor
-from fhash_codec.cost.probe import probe_paper
+from fhash_codec.cost.probe import growth_factors, growth_powers, probe_compact, sample_of
 from fhash_codec.cost.results import (
     DEFAULT,
+    OWN,
     CostReport,
     Curve,
     Encoded,
@@ -43,7 +41,7 @@ from fhash_codec.devices import machine
 from fhash_codec.features.selection import Source, mask_files, open_source, select_features
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import FhashError, InputError
+from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
 BUDGET = 120.0
@@ -52,14 +50,15 @@ ENCODE_SHARE = 0.65
 """Share of the time for further encodings, after those that are always measured."""
 READ_SHARE = 0.5
 """Share of the time after encoding for reads; the rest is for pictures."""
-ADVICE_SHARE = 0.55
-"""Share of the budget in which the advice should be measured, else of a crop."""
-ADVICE_ENCODINGS = 6
-"""Time of the encodings for the advice but the network, as a multiple of the default settings'."""
-PROBED_VERTICES = 1 << 21
-"""Vertices of the crop from which these times are foretold."""
-MIN_VERTICES = 1 << 14
-"""Vertices below which a crop is not made smaller."""
+WHOLE_ENCODINGS = 4 / 3
+"""Time of the default settings and one quick encoding, which takes about a third of it, over that
+of the default settings: the whole series is measured where these two fit."""
+SAMPLE_ENCODINGS = 4.0
+"""Time of the default settings and the advice, likewise, that fits for a sample."""
+PROBED_VERTICES = 1 << 19
+"""Vertices of the first quick encoding, by which the time of the others is predicted."""
+MIN_VERTICES = 1 << 16
+"""Vertices of a sample at least."""
 MAX_READ_FILES = 8
 """Files that reads are measured from, at most."""
 NOTES = (
@@ -67,8 +66,8 @@ NOTES = (
     " measurement of the written file; those of a peer are encoding and writing alone, on one"
     " thread, from memory",
     "bytes of fhash are those of the file, those of a peer the stored chunks alone",
-    "PSNR is over all finite values with the range of what was measured; the bulk is the middle"
-    " 98 % of the values, relative to its own width",
+    "PSNR is over all finite values measured, with the range of the whole series; the bulk is the"
+    " middle 98 % of the values, relative to its own width",
     "a curve of training is measured on samples; with the schedule 'cosine' a training that is"
     " planned shorter ends higher than its curve at that time",
     "a read opens the file anew; the operating system has it in memory; medians of 5 random places",
@@ -77,10 +76,13 @@ NOTES = (
     " pictures and encodings, which decode it",
     "pictures by step length, threshold and level of detail are compared with the finest of the"
     " group, those by encoding with the picture of the source",
-    "hollow points are predicted, not measured; they are drawn where seconds and bytes of all that"
-    " was measured at the same effort lay within 25 % of their predictions",
-    "the fastest exceeds its accuracy by less than 5 dB where possible, the smallest is the fastest"
-    " of those within 1 % of the fewest bytes, the default the smallest of its effort",
+    "of a sample, seconds and bytes are scaled up to the whole series: in proportion, and by the"
+    " power with which they grew from a quarter of the sample to all of it, at least within a"
+    " factor of 2 of the seconds; its promises refer to the range of the whole",
+    "encodings in less than 0.2 s, and those that took longer than a higher PSNR of their effort,"
+    " are the fastest of 3 runs, or that time; the smallest is the fastest of those"
+    " within 1 % of the fewest bytes, the default the smallest of its effort; each accuracy counts"
+    " for the lower ones, too",
     "with features, errors count in them alone, and a peer encodes all vertices",
 )
 
@@ -94,9 +96,10 @@ def measure_cost(
 ) -> CostReport:
     """Measure what accuracy costs on a series.
 
-    The default settings and the published network are always measured, of a crop where the series
-    is large. The most telling of the others come first; the result names what the time does not
-    allow. Ctrl-C ends the measurements, and what there is by then is returned.
+    The default settings are always measured. The most telling of the others come first; the result
+    names what the time does not allow. Where the encodings of the whole series would take too long,
+    a sample is measured, and seconds and bytes are scaled up to the whole. Ctrl-C ends the
+    measurements, and what there is by then is returned.
 
     Args:
         source: a file, a Series or an array.
@@ -114,8 +117,7 @@ def measure_cost(
         open_source(source) as whole,
         tempfile.TemporaryDirectory(prefix="fhash-cost-") as folder,
     ):
-        series = _measurable(whole, features, budget, progress)
-        facts = facts_of(series, progress, features)
+        series, facts, scale = _measurable(whole, features, budget, progress)
         if not facts.width:
             raise InputError(
                 f"{whole.source}: '{whole.name}' is constant; accuracy costs nothing there"
@@ -123,16 +125,28 @@ def measure_cost(
         peers = PeerEncodings(series, facts, Path(folder), allowance, progress)
         reads: list[Read] = []
         pictures: list[Picture] = []
-        predict = Predictor(series).predict
-        own = OwnEncodings(series, Path(folder), allowance, predict, progress)
+        own = OwnEncodings(series, facts, Path(folder), allowance, progress)
+        powers = None
         with allowance.work("further encodings"):
+            if series is not whole:
+                quick = EncodeConfig(features=features, effort=1, psnr=DEFAULT_PSNR)
+                progress("predicting", 0, 1, "")
+                powers = growth_powers(series, facts, quick)
+                progress("predicting", 1, 1, "")
             _encode(own, peers, allowance, features)
         if not allowance.interrupted:
             with allowance.work("further reads and pictures"):
                 measure_uses(series, facts, own.files, allowance, progress, reads, pictures)
         points = [*own.points, *peers.points]
-        if allowance.interrupted and not any(point.measured for point in points):
+        if allowance.interrupted and not points:
             raise KeyboardInterrupt
+        if powers is not None:
+            raw_bytes, vertices = _raw_bytes(whole), prod(whole.shape) / prod(series.shape)
+            own_factors, peer_factors = (growth_factors(powers, n) for n in (scale, vertices))
+            points = [  # a peer encodes all vertices, and not the features alone
+                point.grown(*(own_factors if point.codec in OWN else peer_factors), raw_bytes)
+                for point in points
+            ]
         return report_on(
             whole,
             series,
@@ -145,6 +159,10 @@ def measure_cost(
             advice=advise(points, facts.width),
             features=features,
         )
+
+
+def _raw_bytes(series: Series) -> int:
+    return prod(series.shape) * series.dtype.itemsize
 
 
 def _encode(
@@ -169,28 +187,47 @@ def _encode(
 
 def _measurable(
     whole: Series, features: tuple[str, ...], budget: float, progress: Progress
-) -> Series:
-    """The series, or a crop of it where network and advice take too much of the budget."""
+) -> tuple[Series, Facts, float]:
+    """The series, or a sample where encodings of the whole take too much of the budget.
+
+    Returns it, its figures, and how many times the work of it the whole is.
+    """
     config = EncodeConfig(features=features)
+    selected = select_features(whole, config, progress)
+    value_range, extent = selected.scanned.value_range, selected.extent
+
+    def sample(vertices: int) -> tuple[Series, Facts, float]:
+        """The sample of so many vertices, or a larger one, which has something of the features."""
+        while True:
+            part = sample_of(whole, vertices, extent.box)
+            try:
+                facts = facts_of(part, silent, features)
+                if part is not whole and facts.width:
+                    samples = select_features(part, config, silent).extent.samples
+                    decibels = 20 * math.log10((value_range.high - value_range.low) / facts.width)
+                    facts = replace(
+                        facts, value_range=value_range, sample=True, decibels=max(decibels, 0.0)
+                    )
+                    return part, facts, extent.samples / samples
+            except InputError:  # nothing of the features
+                pass
+            if part is whole:
+                return whole, facts_of(whole, progress, features), 1.0
+            vertices *= 2
+
     if mask_files(config):  # masks are of the whole series
-        return whole
-    extent = select_features(whole, config, progress).extent
-    part = cropped(whole, PROBED_VERTICES, extent.box)
-    share = select_features(part, config, silent).extent.samples / extent.samples
-    network = replace(config, preset="published")
+        return whole, facts_of(whole, progress, features), 1.0
     progress("predicting", 0, 1, "")
-    others = ADVICE_ENCODINGS * Predictor(part).predict(config).seconds / share
-    probe = None
-    with suppress(FhashError):  # told where the network is encoded
-        probe = probe_paper(part, share, network)
+    part, facts, scale = sample(PROBED_VERTICES)
+    if facts.width:
+        # The first encoding of a process also pays for what is loaded.
+        probe_compact(sample(MIN_VERTICES)[0], config)
+        stages = probe_compact(part, config).stage_seconds(round(scale * prod(part.shape)))
+        fitting = ENCODE_SHARE * budget / sum(stages.values())  # default encodings of the whole
+        share = 1.0 if fitting >= WHOLE_ENCODINGS else fitting / SAMPLE_ENCODINGS
+        part, facts, scale = sample(max(int(share * prod(whole.shape)), MIN_VERTICES))
     progress("predicting", 1, 1, "")
-    kept = 1.0
-    while kept * prod(whole.shape) > MIN_VERTICES:
-        training = () if probe is None else probe.of_share(kept).stage_seconds(network).values()
-        if kept * others + sum(training) <= ADVICE_SHARE * budget:
-            break
-        kept *= 0.8
-    return cropped(whole, math.ceil(kept * prod(whole.shape)), extent.box)
+    return part, facts, scale
 
 
 def measure_uses(
@@ -229,13 +266,13 @@ def report_on(
     parts: the fields of CostReport that hold measurements, by name; others stay empty.
     """
     return CostReport(
-        series=f"{whole.source} {whole.name}",
+        series=f"{Path(whole.source).name} {whole.name}",
         units=whole.units,
         dtype=whole.dtype.name,
         shape=whole.shape,
         measured=described(series),
         measured_shape=series.shape,
-        raw_bytes=facts.raw_bytes,
+        raw_bytes=_raw_bytes(whole),
         value_range=(facts.value_range.low, facts.value_range.high),
         budget_seconds=allowance.seconds,
         seconds=allowance.spent,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import prod
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -14,19 +14,15 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.boxes import Box
+from fhash_codec.compact.goal import promise
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.plan import (
-    Allowance,
-    Wish,
-    options_of,
-)
-from fhash_codec.cost.prediction import Prediction
-from fhash_codec.cost.results import DEFAULT, TRAINING, Curve, Encoded
+from fhash_codec.cost.plan import QUICK, RUNS, Allowance, Facts, Wish, options_of
+from fhash_codec.cost.probe import of_width
+from fhash_codec.cost.results import BOUND, DEFAULT, TRAINING, Curve, Encoded
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import (
-    FhashError,
     FhashWarning,
     InterruptedEncodingError,
     QualityError,
@@ -35,12 +31,6 @@ from fhash_formats.series import Series
 
 ONE_SHARE = 0.6
 """Share of the time left for encoding that one encoding may take, so that others follow."""
-PREDICT_SHARE = 0.05
-"""Share of the budget that predicting may take; without a prediction USUAL_SECONDS serve."""
-USUAL_RATE = 2e6
-"""Vertices a second of the fastest encoding, before one was measured."""
-USUAL_SECONDS = {1: 1.0, 2: 3.0, 3: 5.0, 5: 15.0, 7: 40.0, 9: 80.0}
-"""Rough seconds of each effort over those of effort 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +46,7 @@ class OwnEncodings:
     """The encodings of one series by this package.
 
     Attributes:
-        points: what was measured, or predicted only.
+        points: what was measured.
         curves: courses of trainings.
         files: the containers made, in the folder given.
     """
@@ -64,86 +54,64 @@ class OwnEncodings:
     def __init__(
         self,
         series: Series,
+        facts: Facts,
         folder: Path,
         allowance: Allowance,
-        predict: Callable[[EncodeConfig], Prediction],
         progress: Progress,
     ) -> None:
         """Prepare; nothing is encoded yet.
 
         Args:
             series: what is encoded.
+            facts: its figures; of a sample, PSNR and promises refer to the range of the whole.
             folder: place of the containers, which the caller removes.
             allowance: the time there is.
-            predict: predicts an encoding of the series.
             progress: called with each step of the work.
         """
-        self._predict_one = predict
-        self._series, self._folder = series, folder
+        self._series, self._facts, self._folder = series, facts, folder
         self._allowance, self._progress = allowance, progress
         self.points: list[Encoded] = []
         self.curves: list[Curve] = []
         self.files: list[KeptFile] = []
-        self._ratios: list[float] = []
-        self._predictions: dict[EncodeConfig, Prediction] = {}
         self._usual: dict[int, float] = {}
-        self._predicting = 0.0
+        self._begun: set[str] = set()
 
     def measure(self, wish: Wish, *, share: float = ONE_SHARE) -> None:
-        """Measure a wish, or keep its prediction where there is no time for it.
-
-        A wish that was measured before is not measured again.
+        """Measure a wish, once, if there is time for it.
 
         share: share of the time left that it may take.
         """
         assert wish.config is not None
-        before = next((point for point in self.points if point.name == wish.name), None)
-        if before is not None and before.measured:
+        if wish.name in self._begun:
             return
-        if wish.group == TRAINING and all(curve.name != DEFAULT for curve in self.curves):
-            self._allowance.leave_out(wish.name, "the default settings expect no gain from an MLP")
-            return
-        with self._allowance.work(f"prediction of {wish.name}"):
-            self._predict(wish.config)
-        point = _predicted(wish, self._predictions.get(wish.config))
-        expected = self._expected(wish.config)
-        if wish.always or self._allowance.has(wish.name, expected, share=share):
+        if wish.group == TRAINING:
+            why = ""
+            if self._facts.sample:
+                why = "the training of a sample says little of that of the whole"
+            elif all(curve.name != DEFAULT for curve in self.curves):
+                why = "the default settings expect no gain from an MLP"
+            if why:
+                self._allowance.leave_out(wish.name, why)
+                return
+        if wish.always or self._allowance.has(wish.name, self._expected(wish.config), share=share):
+            self._begun.add(wish.name)
             with self._allowance.work(wish.name):
-                point = self._encode(wish, point, share)
-        if before is not None:
-            self.points.remove(before)
-        if point.measured or point.predicted_seconds is not None:
-            self.points.append(point)
-
-    def _predict(self, config: EncodeConfig) -> None:
-        """Predict an encoding, unless predictions have taken their share of the time."""
-        spent = self._allowance.spent
-        limit = PREDICT_SHARE * self._allowance.seconds
-        if config in self._predictions or self._predicting > limit:
-            return
-        self._progress("predicting", 0, 1, "")
-        self._predictions[config] = self._predict_one(config)
-        self._progress("predicting", 1, 1, "")
-        self._predicting += self._allowance.spent - spent
+                self._encode(wish, share)
 
     def _expected(self, config: EncodeConfig) -> float:
-        """Seconds that an encoding will take: as one of its kind did, or by its prediction."""
-        prediction = self._predictions.get(config)
-        if config.effort in self._usual:
-            return self._usual[config.effort] + (config.training_seconds or 0.0)
-        if prediction is not None:
-            # This machine, under its present load, differs from the predictions by a factor.
-            return prediction.seconds * median(self._ratios or [1.0])
-        fastest = self._usual.get(1, prod(self._series.shape) / USUAL_RATE)
-        return fastest * USUAL_SECONDS[config.effort]
+        """Seconds that an encoding will take at least: those of the nearest effort measured."""
+        if not self._usual:
+            return 0.0
+        above = [effort for effort in self._usual if effort >= config.effort]
+        return self._usual[min(above, default=max(self._usual))] + (config.training_seconds or 0.0)
 
-    def _encode(self, wish: Wish, point: Encoded, share: float) -> Encoded:
-        """Encode, and keep the file; the point as predicted where that failed.
+    def _encode(self, wish: Wish, share: float) -> None:
+        """Encode, and keep the file and its figures.
 
         share: share of the time left after which the encoding is stopped, unless it is made always.
         """
         assert wish.config is not None
-        path, config = self._folder / f"{len(self.files)}.fhz", wish.config
+        path, config = self._folder / f"{len(self.files)}.fhz", self._of_sample(wish.config)
         if config.published:  # it trains until it keeps its promise
             config = replace(config, train_on_seconds=int(share * self._allowance.left))
         guarded = self._progress
@@ -155,43 +123,51 @@ class OwnEncodings:
                 warnings.simplefilter("ignore", FhashWarning)
                 timed = replace(config, timings=True)  # for the course of the training
                 report = encode(self._series, path, timed, force=True, progress=guarded)
+                seconds = report["seconds"]
+                runs, most = 1, self._longest(wish)
+                while runs < RUNS and (seconds < QUICK or seconds > most):
+                    report = encode(self._series, path, timed, force=True, progress=guarded)
+                    seconds, runs = min(seconds, report["seconds"]), runs + 1
+                seconds = min(seconds, most)
         except QualityError as error:
             report, missed = error.figures, True
+            seconds = report["seconds"]
         except InterruptedEncodingError:  # a training turns Ctrl-C into this
             raise KeyboardInterrupt from None
-        except FhashError as error:
-            self._allowance.leave_out(wish.name, str(error))
-            return point
         finally:
             for leftover in self._folder.glob("*.checkpoint"):
                 leftover.unlink()
-        measured = encoded_of(report, point, missed=missed)
+        point = Encoded(
+            name=wish.name, codec=wish.codec, group=wish.group, options=options_of(wish.config)
+        )
+        point = encoded_of({**report, "seconds": seconds}, point, missed=missed)
+        if point.psnr is not None:
+            point = replace(point, psnr=point.psnr + self._facts.decibels)
+        self.points.append(point)
         kept = Path(report["path"])
-        self.files.append(KeptFile(name=measured.name, path=kept, psnr=measured.psnr))
+        self.files.append(KeptFile(name=point.name, path=kept, psnr=point.psnr))
         if report["curve"]:
-            self.curves.append(Curve(name=measured.name, points=tuple(report["curve"])))
+            self.curves.append(Curve(name=point.name, points=tuple(report["curve"])))
         if not wish.config.published and wish.group != TRAINING:
-            self._usual[wish.config.effort] = report["seconds"]
-            if point.predicted_seconds:
-                self._ratios.append(report["seconds"] / point.predicted_seconds)
-        return measured
+            self._usual[wish.config.effort] = seconds
 
+    def _longest(self, wish: Wish) -> float:
+        """Seconds beyond which a time is noise: those of a higher PSNR with the same effort."""
+        asked = math.inf if wish.config is None or wish.config.psnr is None else wish.config.psnr
+        higher = (
+            point.seconds
+            for point in self.points
+            if point.group == wish.group and BOUND not in point.options
+            if (point.psnr or 0.0) > asked + 1.0
+        )
+        return min(higher, default=math.inf)
 
-def _predicted(wish: Wish, prediction: Prediction | None) -> Encoded:
-    """The point of a wish before it is measured."""
-    assert wish.config is not None
-    point = Encoded(
-        name=wish.name, codec=wish.codec, group=wish.group, options=options_of(wish.config)
-    )
-    if prediction is None:
-        return point
-    return replace(
-        point,
-        predicted_seconds=prediction.seconds,
-        predicted_bytes=prediction.bytes,
-        predicted_psnr=prediction.psnr,
-        basis=prediction.basis,
-    )
+    def _of_sample(self, config: EncodeConfig) -> EncodeConfig:
+        """The settings with which a sample gets the errors that the whole series would have."""
+        if not self._facts.sample:
+            return config
+        promised: dict[str, Any] = {**promise(config, self._facts.value_range, self._facts.bulk)}
+        return of_width(replace(config, **promised), self._facts.decibels)
 
 
 def encoded_of(report: Mapping[str, Any], point: Encoded, *, missed: bool) -> Encoded:

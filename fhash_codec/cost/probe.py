@@ -11,15 +11,16 @@ from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from fhash_codec.boxes import Box
 from fhash_codec.comparison import EncodeReport
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.plan import cropped
+from fhash_codec.cost.plan import Facts, cropped
 from fhash_codec.encoding import encode
 from fhash_codec.features.bricks import BRICK_BITS
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.train import HISTORY_POINTS, usual_batches, usual_epochs
 from fhash_codec.progress import OTHER, silent
-from fhash_formats.errors import FhashWarning, QualityError
+from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.series import Series, StepsSeries
 
 now: Callable[[], float] = time.perf_counter
@@ -82,10 +83,20 @@ def promise_of_part(config: EncodeConfig, part: Series, series: Series) -> Encod
     whole = max(each.high for each in ranges) - min(each.low for each in ranges)
     if not 0 < width < whole < math.inf:
         return config
+    return of_width(config, 20 * math.log10(whole / width))
+
+
+def of_width(config: EncodeConfig, decibels: float) -> EncodeConfig:
+    """Return settings that allow a part the errors promised for the whole series.
+
+    decibels: width of the range of the whole over that of the part.
+    """
     if config.max_error_rel is not None:
-        return replace(config, max_error_rel=min(config.max_error_rel * whole / width, 1.0))
-    assert config.psnr is not None
-    return replace(config, psnr=max(config.psnr - 20 * math.log10(whole / width), 0.0))
+        relative = config.max_error_rel * math.pow(10.0, decibels / 20)
+        return replace(config, max_error_rel=min(relative, 1.0))
+    if config.psnr is None:
+        return config
+    return replace(config, psnr=max(config.psnr - decibels, 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +154,71 @@ def probe_compact(part: Series, config: EncodeConfig) -> CompactProbe:
         fixed_bytes=fixed,
         growing_bytes=report["bytes"] - fixed,
         psnr=report["psnr"] if report["rmse"] else None,
+    )
+
+
+def sample_of(series: Series, vertices: int, around: Box) -> Series:
+    """Return windows of steps with whole frames, a crop where there are few, or all of a small one.
+
+    vertices: of the sample, about. around: box (z, y, x) around whose middle a crop lies.
+    """
+    if vertices >= prod(series.shape):
+        return series
+    if vertices >= 2 * WINDOW_STEPS * prod(series.shape[1:]):
+        return windows_of(series, vertices)
+    return cropped(series, vertices, around)
+
+
+SECONDS_WITHIN = 2.0
+"""Factor within which seconds were in proportion to those of a part, in most of the series that
+tests and benchmarks have."""
+BYTES_WITHIN = 1.7
+"""The same factor of bytes, which were fewer more often than more."""
+SMALLER = 4
+"""Vertices of a sample over those of the smaller one to which it is compared."""
+Range = tuple[float, float]
+"""Lower and upper end."""
+
+
+def growth_powers(sample: Series, facts: Facts, config: EncodeConfig) -> tuple[float, float]:
+    """Return the powers of the number of vertices with which seconds and bytes grow; 1 as it does.
+
+    A sample and a part of it are encoded with the same error.
+
+    facts: with the range of the whole series. config: quick settings with a PSNR.
+    """
+    part = sample_of(sample, prod(sample.shape) // SMALLER, Box.of_shape(sample.shape[1:]))
+    figures = []
+    for series in (sample, part):
+        found = scan(series, silent).value_range
+        width = found.high - found.low
+        asked = of_width(config, 20 * math.log10(facts.width / width) if width else 0.0)
+        with TemporaryDirectory() as folder:
+            try:
+                report = reported(series, Path(folder) / "part.fhz", asked)
+            except InputError:  # nothing of the features is in the part
+                return 1.0, 1.0
+        figures.append((report["seconds"], report["bytes"]))
+    ratio = prod(sample.shape) / prod(part.shape)
+    if ratio == 1:  # it is too small to be divided
+        return 1.0, 1.0
+    seconds, sizes = (math.log(a / b) / math.log(ratio) for a, b in zip(*figures, strict=True))
+    return seconds, sizes
+
+
+def growth_factors(powers: tuple[float, float], scale: float) -> tuple[Range, Range]:
+    """Return factors from a sample to the whole, lower and upper, on seconds and on bytes.
+
+    Bytes grow as from the part to the sample at least, and in proportion at most. Smooth data
+    grow less than in proportion: a file of one large part is smaller than those of its pieces.
+    What predictions were off by, SECONDS_WITHIN and BYTES_WITHIN, is always included.
+
+    powers: of `growth_powers`. scale: vertices of the whole over those of the sample, 1 or more.
+    """
+    seconds, sizes = (sorted((max(math.pow(scale, power), 1.0), scale)) for power in powers)
+    return (
+        (min(seconds[0], scale / SECONDS_WITHIN), max(seconds[1], scale * SECONDS_WITHIN)),
+        (max(min(sizes[0], scale / BYTES_WITHIN), 1.0), sizes[1]),
     )
 
 

@@ -13,7 +13,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +36,6 @@ from fhash_codec.cost.results import (
     feature_options,
     seconds_text,
     told,
-    trusted,
 )
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
 from fhash_formats.support.files import check_output, explained, replacing_all
@@ -70,14 +69,14 @@ class Point(NamedTuple):
     Attributes:
         curve: name of its curve.
         text: what the mouse shows.
-        area: in square points.
+        ends: lower and upper estimate of x; None where it was measured.
     """
 
     curve: str
     x: Any
     y: Any
     text: str
-    area: float = 24.0
+    ends: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,9 @@ class Panel:
         curves: the points of each curve, by its name.
         log: names of the logarithmic axes, such as "xy".
         line: whether the points of a curve are joined.
+        best: whether only those are joined than which none is better in x and y: the others are
+            noise of times, or not worth their bytes.
         bars: whether the points are horizontal bars.
-        diagonal: whether a line shows where x equals y.
     """
 
     key: str
@@ -102,8 +102,8 @@ class Panel:
     curves: dict[str, list[Point]]
     log: str = ""
     line: bool = True
+    best: bool = False
     bars: bool = False
-    diagonal: bool = False
 
 
 def curves(points: Iterable[Point]) -> dict[str, list[Point]]:
@@ -117,16 +117,16 @@ def curves(points: Iterable[Point]) -> dict[str, list[Point]]:
 
 def style_of(name: str, place: int) -> tuple[str, str]:
     """Colour and marker of a curve, by its name or its place."""
-    name = name.removesuffix(PREDICTED).removesuffix(BOUND)
+    name = name.removesuffix(BOUND)
     return STYLES.get(name, (CYCLE[place % len(CYCLE)], SYMBOLS[place % len(SYMBOLS)]))
 
 
-PREDICTED = ", predicted"
-"""End of the name of a curve of predictions, whose points are hollow and not joined."""
 BOUND = ", error bound"
 """End of the name of a curve of strict bounds, whose points are not joined: their dB follow."""
 SIZE = "size of the file, bytes"
 """Label of the size."""
+TOOK = "seconds of encoding"
+"""Label of the time of an encoding."""
 TIME = "milliseconds"
 """Label of the time of a read or a picture."""
 ERROR = "largest error"
@@ -139,28 +139,24 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
     decibel = "PSNR of all values, dB"
     points = report.encodings
     if len(points) > 1:
-        title = "Quality against time; large points are large files"
-        made = _frontier(points, "seconds", "psnr")
-        yield Panel("answer", "", title, "seconds of encoding", decibel, made, log="x")
+        for key, section, title, x, y, fields, log in (
+            ("answer", "", "Quality against time", TOOK, decibel, ("seconds", "psnr"), "x"),
+            ("encode-bytes", "", "Quality against size", SIZE, decibel, ("bytes", "psnr"), "x"),
+            (
+                "encode-bulk", "encode", "Quality of the bulk against size", SIZE,
+                "PSNR of the middle 98 %, dB", ("bytes", "psnr_bulk"), "x",
+            ),
+            (
+                "encode-error", "encode", "Largest error against size", SIZE,
+                f"{ERROR}, {units}", ("bytes", "max_abs_error"), "xy",
+            ),
+        ):  # fmt: skip
+            made = _frontier(points, *fields)
+            yield Panel(key, section, title, x, y, made, log=log, best=True)
         made = curves(
             Point(TRAINING, each.seconds, each.bytes, _hover(each)) for each in by_training(report)
         )
-        title, x = "What training saves, at the accuracy of the default", "seconds of encoding"
-        yield Panel("saved", "", title, x, SIZE, made)
-        for key, title, y, field, log in (
-            ("bytes", "Accuracy", decibel, "psnr", "x"),
-            ("bulk", "Accuracy of the bulk", "PSNR of the middle 98 %, dB", "psnr_bulk", "x"),
-            ("error", "Largest error", f"{ERROR}, {units}", "max_abs_error", "xy"),
-        ):
-            made, title = _frontier(points, "bytes", field), f"{title} against size"
-            yield Panel(f"encode-{key}", "encode", title, SIZE, y, made, log=log)
-    made = curves(
-        Point(each.group, each.predicted_seconds, each.seconds, _hover(each))
-        for each in points
-        if each.predicted_seconds and each.measured
-    )
-    title, x, y = "Predicted and measured time", "seconds predicted", "seconds measured"
-    yield Panel("predicted", "encode", title, x, y, made, log="xy", line=False, diagonal=True)
+        yield Panel("saved", "", "Size against training, at one promise", TOOK, SIZE, made)
     made = curves(
         Point(one.name, at["seconds"], at["psnr"], f"{one.name}\nepoch or update {at['epoch']:g}")
         for one in report.curves
@@ -182,32 +178,24 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
 
 
 def _frontier(points: Sequence[Encoded], x: str, y: str) -> dict[str, list[Point]]:
-    """A curve of measured points for each group, and one of the predictions that are trusted."""
-    points = [point for point in points if point.group != TRAINING]
-    drawn, largest = trusted(points), max((point.bytes or 0 for point in points), default=0) or 1
-    made = []
-    for point in points:
-        if point.measured or point.group in drawn:
-            end = BOUND if "--max-error" in point.options else ""
-            kind, end = ("", end) if point.measured else ("predicted_", end + PREDICTED)
-            at = [getattr(point, f"{kind}{name}", None) for name in (x, y, "bytes")]
-            # The root, so that files of 20 kB and 20 MB can be told apart in one plot.
-            area = 12 + 150 * ((at[2] or 0) / largest) ** 0.5
-            made.append(Point(point.group + end, at[0], at[1], _hover(point), area))
-    return {
-        name: sorted(each, key=lambda point: (point.y, point.x))
-        for name, each in curves(made).items()
-    }
+    """A curve of points for each group, by quality; strict bounds are curves of their own."""
+    made = curves(
+        Point(
+            point.group + (BOUND if "--max-error" in point.options else ""),
+            getattr(point, x),
+            getattr(point, y),
+            _hover(point),
+            getattr(point, f"{x}_range"),
+        )
+        for point in points
+        if point.group != TRAINING
+    )
+    return {name: sorted(each, key=lambda point: (point.y, point.x)) for name, each in made.items()}
 
 
 def _hover(point: Encoded) -> str:
     """Text that the mouse shows at an encoding."""
-    lines = [point.name, told(point)] if point.measured else [point.name]
-    if point.predicted_seconds is not None:
-        size, psnr = point.predicted_bytes, point.predicted_psnr
-        foretold = replace(point, seconds=point.predicted_seconds, bytes=size, psnr=psnr)
-        lines.append(f"predicted: {told(foretold)}")
-    return "\n".join(lines + ["misses its promise"] * point.missed)
+    return "\n".join([point.name, told(point)] + ["misses its promise"] * point.missed)
 
 
 def read_panels(report: CostReport) -> Iterator[Panel]:
@@ -339,38 +327,39 @@ def plot(report: CostReport, path: Path) -> None:
     module = require_matplotlib()
     made = panels(report)
     shown = [panel for panel in made if not panel.section] if report.advice else made[:2]
+    rows = [ADVICE, *advice_rows(report)] if report.advice else []
+    told_lines = [*textwrap.wrap(conclusion(report), 170), *textwrap.wrap(_facts(report), 170)]
     with importlib.import_module("matplotlib").rc_context(RC):
-        figure = module.Figure(figsize=(12.8, 6.4), layout="constrained", dpi=100)
-        title = [TITLE + report.series, *textwrap.wrap(conclusion(report), 150)]
-        figure.suptitle("\n".join(title))
-        left, right = figure.add_gridspec(1, 2, width_ratios=(5, 6))
-        if report.advice:
-            places = left.subgridspec(len(shown) or 1, 1, height_ratios=(3, 2)[: len(shown) or 1])
-            axes = [figure.add_subplot(place) for place in places]
-            _draw_advice(figure.add_subplot(right, frame_on=False, xticks=[], yticks=[]), report)
+        height = max(ROW * len(rows), 2.9 * len(shown)) + 1.3 if rows else 5.0
+        figure = module.Figure(figsize=(14.0, height), layout="constrained", dpi=100)
+        figure.suptitle("\n".join([TITLE + report.series, *told_lines]), fontsize=9)
+        if rows:
+            left, right = figure.add_gridspec(1, 2, width_ratios=(8, 5))
+            _draw_advice(figure.add_subplot(left, frame_on=False, xticks=[], yticks=[]), report)
+            places = right.subgridspec(max(len(shown), 1), 1)
         else:
-            axes = [figure.add_subplot(place) for place in (left, right)]
-        for each, panel in zip(axes, shown, strict=False):
-            _draw(each, panel)
-        for each in axes[len(shown) :]:
-            each.set_axis_off()
+            places = figure.add_gridspec(1, 2)
+        for place, panel in zip(places, shown, strict=False):
+            _draw(figure.add_subplot(place), panel)
         figure.savefig(path, format="png")
+
+
+ROW = 0.29
+"""Inches of a row of the table."""
 
 
 def _draw_advice(axes: Any, report: CostReport) -> None:
     rows = [ADVICE, *advice_rows(report)]
     lengths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
-    height = min(0.055 * len(rows), 1.0)
     widths = [length / sum(lengths) for length in lengths]
-    cells = axes.table(
-        rows, colWidths=widths, bbox=(0, 1 - height, 1, height), edges="B", cellLoc="left"
-    )
+    cells = axes.table(rows, colWidths=widths, bbox=(0, 0, 1, 1), edges="B", cellLoc="left")
     cells.auto_set_font_size(False)
     for (row, column), cell in cells.get_celld().items():
         cell.set_edgecolor(LINE)
         bold = row == 0 or column == 0
-        cell.set_text_props(fontsize=8.5, fontweight="bold" if bold else "normal")
-    axes.set_title(_command(report), fontsize=8.5)
+        cell.set_text_props(fontsize=8, fontweight="bold" if bold else "normal")
+        cell.PAD = 0.02
+    axes.set_title(_command(report), fontsize=9)
 
 
 def svg(panel: Panel) -> str:
@@ -396,26 +385,26 @@ def _draw(axes: Any, panel: Panel) -> list[str]:
     texts: list[str] = []
     for place, (name, points) in enumerate(panel.curves.items()):
         colour, marker = style_of(name, place)
-        hollow = name.endswith(PREDICTED)
-        _, x, y, shown, areas = zip(*points, strict=True)
+        _, x, y, shown, ends = zip(*points, strict=True)
         links = [f"{len(texts) + number}" for number in range(len(points))]
         texts += shown
         if panel.bars:
             for bar, link in zip(axes.barh(y, x, color=colour), links, strict=True):
                 bar.set_url(link)
             continue
-        if panel.line and not name.endswith((PREDICTED, BOUND)):
-            axes.plot(x, y, color=colour, linewidth=1.2)
-        made = axes.scatter(x, y, s=areas, marker=marker, zorder=3, edgecolors=colour,
-                            facecolors="none" if hollow else colour,
+        if panel.line and not name.endswith(BOUND):
+            joined = _best(points, panel) if panel.best else points
+            axes.plot(*[[each[at] for each in joined] for at in (1, 2)], color=colour, lw=1.2)
+        spans = [(y, *span) for y, span in zip(y, ends, strict=True) if span is not None]
+        axes.hlines(
+            *zip(*spans, strict=True) if spans else ([], [], []), color=colour, lw=3, alpha=0.3
+        )
+        made = axes.scatter(x, y, s=24, marker=marker, zorder=3, color=colour,
                             label=("_" if name.endswith(BOUND) else "") + name)  # fmt: skip
         made.set_urls(links)
         for at in (point[1:3] for point in points if point.text.startswith(DEFAULT)):
             axes.scatter(*at, s=260, facecolors="none", edgecolors=INK, linewidths=1.3, zorder=4)
             axes.annotate("default", at, (11, 9), textcoords="offset points", fontweight="bold")
-    if panel.diagonal:
-        ends = [end for points in panel.curves.values() for point in points for end in point[1:3]]
-        axes.plot(*[[min(ends), max(ends)]] * 2, color=INK, linestyle=":", linewidth=1)
     for name, label in (("x", panel.x), ("y", panel.y)):
         getattr(axes, f"set_{name}label")(label)
         text = bytes_text if "bytes" in label else "{:g}".format
@@ -435,6 +424,19 @@ def _draw(axes: Any, panel: Panel) -> list[str]:
         for handle in legend.legend_handles:
             handle.set_sizes([24])
     return texts
+
+
+def _best(points: Sequence[Point], panel: Panel) -> list[Point]:
+    """The points than which no other is at least as good in both x and y."""
+    sign = -1 if panel.y.startswith(ERROR) else 1
+    return [
+        point
+        for point in points
+        if not any(
+            other is not point and other.x <= point.x and sign * other.y >= sign * point.y
+            for other in points
+        )
+    ]
 
 
 def _set_logarithmic(axes: Any, name: str, shown: Callable[[float], str]) -> None:
@@ -484,7 +486,7 @@ def page(report: CostReport) -> str:
         "title": escape(TITLE + report.series),
         "conclusion": re.sub(r"--[\w-]+", r"<code>\g<0></code>", escape(conclusion(report))),
         "facts": escape(_facts(report)),
-        "answer": answer + (_advice(report) if report.advice else ""),
+        "answer": (_advice(report) if report.advice else "") + answer,
         "tabs": "".join(_tab(name, report, made) for name in SECTIONS).replace(
             ' id="tab', ' checked id="tab', 1
         ),
@@ -500,12 +502,14 @@ def _command(report: CostReport) -> str:
 
 def _facts(report: CostReport) -> str:
     """A line on the measurement."""
-    shape = " x ".join(map(str, report.measured_shape))
+    whole, part = (" x ".join(map(str, n)) for n in (report.shape, report.measured_shape))
     return (
-        f"Measured: {report.measured}, {shape} (t, z, y, x), {report.dtype},"
-        f" {bytes_text(report.raw_bytes)}; {report.seconds:.0f} s of a budget of"
-        f" {report.budget_seconds:.0f} s, {report.machine.get('threads', '?')} threads"
-        + (", interrupted: what was measured by then" if report.interrupted else "")
+        f"Figures are those of the whole file, {whole} (t, z, y, x), {report.dtype},"
+        f" {bytes_text(report.raw_bytes)}. Measured: {report.measured}"
+        + (f", {part}" if part != whole else "")
+        + f"; {report.seconds:.0f} s of a budget of {report.budget_seconds:.0f} s,"
+        f" {report.machine.get('threads', '?')} threads"
+        + (", interrupted" if report.interrupted else "")
     )
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from fhash_codec.config import PRESETS
+from fhash_codec.config import DEFAULT_PSNR, DEFAULT_PSNR_BULK, PRESETS, PUBLISHED
 from fhash_codec.file_info import HistoryPoint
 from fhash_codec.measure.errors import StepErrors
 
@@ -24,33 +24,32 @@ NETWORK = "published network"
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
-    """One encoding: what was predicted, and what was measured.
+    """One encoding, with the figures of the whole series.
 
     Attributes:
         name: the encoding in words, such as "effort 5, 60 dB".
         codec: the preset, or the name of a peer.
         group: the curve that the point belongs to, such as "effort 5".
         options: options of `fhash encode` that give it again; empty for a peer.
-        seconds: of the whole encoding; None where it was predicted only.
+        seconds: of the whole encoding.
         bytes: of the file; for a peer of its stored chunks.
         ratio: raw bytes over `bytes`.
-        psnr: dB over all finite values.
+        psnr: dB over all finite values; None where exact.
         psnr_bulk: dB over the middle 98 % of the values.
         max_abs_error: largest error, in data units.
         exact: whether nothing differs.
         missed: whether the file misses its promise.
         region_ms: milliseconds in which the file is opened and a region of 16^3 is read.
-        predicted_seconds, predicted_bytes, predicted_psnr: what was foretold; None where it was
-            not.
-        basis: what the prediction rests on, in words; empty without one.
+        seconds_range, bytes_range: lower and upper estimate where a sample was encoded, with the
+            middle in `seconds` and `bytes`; None where the whole series was.
     """
 
     name: str
     codec: str
     group: str
     options: str = ""
-    seconds: float | None = None
-    bytes: int | None = None
+    seconds: float = 0.0
+    bytes: int = 0
     ratio: float | None = None
     psnr: float | None = None
     psnr_bulk: float | None = None
@@ -58,19 +57,38 @@ class Encoded:
     exact: bool = False
     missed: bool = False
     region_ms: float | None = None
-    predicted_seconds: float | None = None
-    predicted_bytes: int | None = None
-    predicted_psnr: float | None = None
-    basis: str = ""
+    seconds_range: tuple[float, float] | None = None
+    bytes_range: tuple[int, int] | None = None
+
+    def grown(
+        self, seconds: tuple[float, float], sizes: tuple[float, float], raw_bytes: int
+    ) -> Encoded:
+        """The encoding of a whole series, from that of a sample.
+
+        Args:
+            seconds, sizes: lower and upper factor on the seconds and bytes.
+            raw_bytes: of the whole series.
+        """
+        took = (self.seconds * seconds[0], self.seconds * seconds[1])
+        size = (round(self.bytes * sizes[0]), round(self.bytes * sizes[1]))
+        return replace(
+            self,
+            seconds=sum(took) / 2,
+            seconds_range=took,
+            bytes=sum(size) // 2,
+            bytes_range=size,
+            ratio=2 * raw_bytes / sum(size),
+        )
 
     @property
-    def measured(self) -> bool:
-        """Whether the encoding was made, and not predicted only."""
-        return self.seconds is not None
+    def seconds_text(self) -> str:
+        """The seconds, or their interval, such as 40 to 66 s."""
+        return _span(seconds_text, self.seconds, self.seconds_range)
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values by field name, and `measured`."""
-        return {**asdict(self), "measured": self.measured}
+    @property
+    def bytes_text(self) -> str:
+        """The bytes, or their interval, such as 58 to 75 kB."""
+        return _span(bytes_text, self.bytes, self.bytes_range)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +235,7 @@ class CostReport:
         units: of the values; may be empty. dtype: number type.
         features: of all encodings, as `fhash encode` takes them.
         measured: the part that was measured, in words. measured_shape: its shape.
-        raw_bytes: of the measured part.
+        raw_bytes: of the whole series.
         value_range: smallest and largest value of it.
         budget_seconds, seconds: what was allowed, and what it took.
         interrupted: whether Ctrl-C ended it.
@@ -253,15 +271,15 @@ class CostReport:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""
-        return {**asdict(self), "encodings": [entry.to_dict() for entry in self.encodings]}
+        return asdict(self)
 
 
-TARGETS = (40.0, 45.0, 50.0, 60.0)
+TARGETS = (40.0, 50.0, 60.0)
 """Accuracies in dB that are advised for."""
 ERRORS = (0.01, 0.001)
 """Largest errors that are advised for, as fractions of the range."""
-CLOSE = 5.0
-"""Excess in dB up to which the fastest is looked for first: times are noisy, and sizes count."""
+BOUND = "--max-error"
+"""Beginning of the options that promise a largest error."""
 AS_SMALL = 1.01
 """Factor on the fewest bytes within which the fastest encoding is the smallest."""
 UNITS = ("B", "kB", "MB", "GB")
@@ -272,32 +290,33 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
     """The best of what was measured for each accuracy, by aim.
 
     The aims are the fastest and the smallest encoding of this package, and the smallest with the
-    default effort. Predictions do not count, and an accuracy that nothing reaches is left out. For
-    a largest error only encodings count that promise one: others keep it by chance.
+    default effort. An encoding of a higher accuracy counts for the lower ones, too. For a PSNR only
+    encodings count that promise one, and likewise for a largest error: others keep it by chance.
 
     Args:
-        points: measured encodings, and predicted ones.
+        points: measured encodings.
         width: of the range of the values, in data units.
     """
-    own = [point for point in points if point.measured and point.codec in OWN]
-    usual = next((point.group for point in own if point.name == DEFAULT), None)
+    usual = next((point.group for point in points if point.name == DEFAULT), None)
     found = []
     goals = [*((psnr, None) for psnr in TARGETS), *((0.0, share) for share in ERRORS)]
     for psnr, share in goals:
         bound = math.inf if share is None else share * width * (1 + 1e-9)  # it is rounded itself
         reached = [
             point
-            for point in own
-            if point.exact
-            or (
-                (share is None or "--max-error" in point.options)
-                and (point.psnr or 0.0) >= psnr
-                and (math.inf if point.max_abs_error is None else point.max_abs_error) <= bound
+            for point in points
+            if point.codec in OWN
+            and (
+                point.exact
+                or (
+                    (share is None) != (BOUND in point.options)
+                    and (point.psnr or 0.0) >= psnr
+                    and (math.inf if point.max_abs_error is None else point.max_abs_error) <= bound
+                )
             )
         ]
-        close = [point for point in reached if _excess(point, psnr, bound) < CLOSE]
         for aim, best in (
-            ("fastest", min(close or reached, key=lambda point: point.seconds or 0, default=None)),
+            ("fastest", min(reached, key=_shown_seconds, default=None)),
             ("smallest", smallest(reached)),
             ("default", smallest([point for point in reached if point.group == usual])),
         ):
@@ -316,18 +335,16 @@ def advise(points: Sequence[Encoded], width: float) -> tuple[Advice, ...]:
     return tuple(found)
 
 
-def _excess(point: Encoded, psnr: float, bound: float) -> float:
-    """Excess in dB of an encoding over the accuracy asked for, a PSNR or else a bound."""
-    if psnr:
-        return math.inf if point.psnr is None else point.psnr - psnr
-    return 20 * math.log10(bound / point.max_abs_error) if point.max_abs_error else math.inf
+def _shown_seconds(point: Encoded) -> tuple[float, int]:
+    """Seconds as they are shown, and bytes, which decide between encodings of the same time."""
+    return float(f"{point.seconds:.2g}"), point.bytes
 
 
 def smallest(points: Sequence[Encoded]) -> Encoded | None:
-    """The smallest of some measured encodings, the fastest of those of nearly its size."""
-    least = min((point.bytes or 0 for point in points), default=0)
-    able = [point for point in points if (point.bytes or 0) <= AS_SMALL * least]
-    return min(able, key=lambda point: point.seconds or 0.0, default=None)
+    """The smallest of some encodings, the fastest of those of nearly its size."""
+    least = min((point.bytes for point in points), default=0)
+    able = [point for point in points if point.bytes <= AS_SMALL * least]
+    return min(able, key=lambda point: point.seconds, default=None)
 
 
 ADVICE = ("accuracy", "encoding", "time", "size", "16^3 region", "options")
@@ -338,35 +355,74 @@ def advice_rows(report: CostReport) -> list[tuple[str, ...]]:
     """The table of advice: a row for each accuracy and encoding, with all its aims in one cell.
 
     The accuracy stands in the first of its rows alone; options leave out the features of all rows.
-    The last rows are those of `by_training`.
+    The smallest encoding of each peer follows those of this package, and the published network
+    those with the promise of the default settings. The last rows are those of `by_training`.
     """
-    common = " ".join(feature_options(report))
-    rows: dict[tuple[str, str], list[Advice]] = {}
+    points = {point.name: point for point in report.encodings}
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    aims: dict[tuple[str, str], list[str]] = {}
     for advice in report.advice:
-        rows.setdefault((advice.goal, advice.name), []).append(advice)
-    cells: list[tuple[str, ...]] = []
-    last = ""
-    for (goal, _), entries in rows.items():
-        one = entries[0]
-        cells.append(
-            (
-                "" if goal == last else goal,
-                ", ".join(entry.aim for entry in entries) if len(entries) < 3 else "all three",
-                seconds_text(one.seconds),
-                bytes_text(one.bytes),
-                "-" if one.region_ms is None else seconds_text(one.region_ms, "ms"),
-                " ".join(one.options.replace(common, "").split()) or "none",
+        aims.setdefault((advice.goal, advice.name), []).append(advice.aim)
+    for (goal, name), each in aims.items():
+        aim = ", ".join(each) if len(each) < 3 else "all three"
+        groups.setdefault(goal, []).append(_row(report, aim, points[name]))
+    for psnr in TARGETS:
+        rows = groups.setdefault(f"{psnr:g} dB", [])
+        if psnr == DEFAULT_PSNR:
+            rows += _network_rows(report)
+        for peer in dict.fromkeys(point.codec for point in points.values()):
+            best = smallest(
+                [
+                    point
+                    for point in points.values()
+                    if point.codec == peer not in OWN and (point.exact or (point.psnr or 0) >= psnr)
+                ]
             )
-        )
-        last = goal
-    for place, point in enumerate(by_training(report)):
-        setting = "default" if point.name == DEFAULT else point.name.removeprefix(f"{TRAINING} ")
-        region = "-" if point.region_ms is None else seconds_text(point.region_ms, "ms")
-        size, options = bytes_text(point.bytes or 0), point.options.replace(common, "").strip()
-        goal = "" if place else TRAINING
-        took = seconds_text(point.seconds or 0.0)
-        cells.append((goal, setting, took, size, region, options or "none"))
-    return cells
+            rows += [_row(report, peer, best)] if best else []
+    groups[TRAINING] = [
+        _row(report, "default" if point.name == DEFAULT else point.options.split()[-1], point)
+        for point in by_training(report)
+    ]
+    return [
+        (goal if place == 0 else "", *row)
+        for goal, rows in groups.items()
+        for place, row in enumerate(rows)
+    ]
+
+
+def _row(report: CostReport, what: str, point: Encoded) -> tuple[str, ...]:
+    """The cells of an encoding after the accuracy; a peer has its layout in place of options."""
+    common = " ".join(feature_options(report))
+    options = " ".join(point.options.replace(common, "").split())
+    if point.codec not in OWN:
+        options = point.name.removeprefix(f"{point.codec} ")
+    remarks = ["misses its promise"] * point.missed
+    remarks += ["larger than the data"] * (point.bytes >= report.raw_bytes)
+    return (
+        what,
+        point.seconds_text,
+        point.bytes_text,
+        "-" if point.region_ms is None else seconds_text(point.region_ms, "ms"),
+        "; ".join([options or DEFAULT_OPTIONS, *remarks]),
+    )
+
+
+DEFAULT_OPTIONS = f"default: {DEFAULT_PSNR:g} dB and {DEFAULT_PSNR_BULK:g} dB of the bulk"
+"""What stands for the options of the default settings."""
+
+
+def _network_rows(report: CostReport) -> list[tuple[str, ...]]:
+    """The row of the published network, or of why it has no figures."""
+    measured = [point for point in report.encodings if point.name == NETWORK]
+    if measured:
+        if any(entry.name == NETWORK and entry.psnr == DEFAULT_PSNR for entry in report.advice):
+            return []
+        return [_row(report, NETWORK, measured[0])]
+    return [
+        (NETWORK, "-", "-", "-", f"--preset {PUBLISHED}: {entry.why}")
+        for entry in report.left_out
+        if entry.what == NETWORK
+    ]
 
 
 def by_training(report: CostReport) -> list[Encoded]:
@@ -374,11 +430,11 @@ def by_training(report: CostReport) -> list[Encoded]:
 
     It is empty where no other training was measured.
     """
-    points = [point for point in report.encodings if point.measured]
+    points = report.encodings
     if all(point.group != TRAINING for point in points):
         return []
     chosen = [point for point in points if point.group == TRAINING or point.name == DEFAULT]
-    return sorted(chosen, key=lambda point: point.seconds or 0.0)
+    return sorted(chosen, key=lambda point: point.seconds)
 
 
 def feature_options(report: CostReport) -> list[str]:
@@ -390,50 +446,42 @@ def feature_options(report: CostReport) -> list[str]:
 
 def conclusion(report: CostReport) -> str:
     """One sentence on what was measured; empty where the default settings were not."""
-    points = {point.name: point for point in report.encodings if point.measured}
+    points = {point.name: point for point in report.encodings}
     usual, network = points.get(DEFAULT), points.get(NETWORK)
     if usual is None:
         return ""
-    data = "the data" if report.measured_shape == report.shape else "this crop of the data"
-    ratio = f"{usual.ratio:,.{0 if (usual.ratio or 0) > 99 else 1}f}"
-    parts = [f"The default settings make {data} {ratio} times smaller: {told(usual)}"]
-    parts += [
-        f"the fastest for 50 dB, {advice.options}: {told(points[advice.name])}"
+    sizes = (usual.bytes,) if usual.bytes_range is None else usual.bytes_range[::-1]
+    ratios = [report.raw_bytes / size for size in sizes]
+    ratio = " to ".join(f"{each:,.{0 if each > 99 else 1}f}" for each in ratios)
+    fastest = [
+        f"Fastest that keeps {advice.goal}, {advice.options}: {told(points[advice.name])}. "
         for advice in report.advice
-        if (advice.psnr, advice.aim) == (50.0, "fastest") and advice.name not in (DEFAULT, NETWORK)
+        if (advice.psnr, advice.aim) == (DEFAULT_PSNR, "fastest")
+        and advice.name not in (DEFAULT, NETWORK)
     ]
-    peers = [point for point in points.values() if point.codec not in OWN]
-    peer = smallest([each for each in peers if _excess(each, usual.psnr or math.inf, 0.0) >= 0])
+    parts = [f"The default settings make the data {ratio} times smaller: {told(usual)}"]
+    reached = usual.psnr or math.inf
+    better = [each for each in points.values() if each.exact or (each.psnr or 0.0) >= reached]
+    peer = smallest([each for each in better if each.codec not in OWN])
     if peer is not None:
         parts.append(f"the smallest peer, {peer.codec}: {told(peer)}")
     if network is not None:
         parts.append(f"the published network: {told(network)}")
-    return "; ".join(parts) + "."
+    return "".join(fastest) + "; ".join(parts) + "."
 
 
 def told(point: Encoded) -> str:
     """Size, time and quality of an encoding."""
     quality = ", exact" if point.exact else "" if point.psnr is None else f", {point.psnr:.1f} dB"
-    return f"{bytes_text(point.bytes or 0)}, {seconds_text(point.seconds or 0.0)}{quality}"
+    return f"{point.bytes_text}, {point.seconds_text}{quality}"
 
 
-NEAR = 1.25
-"""Factor between what was predicted and what was measured up to which predictions are drawn."""
-
-
-def trusted(points: Sequence[Encoded]) -> set[str]:
-    """The groups whose predictions are worth drawing.
-
-    In this run seconds and bytes of each encoding of such a group that was predicted and measured,
-    at least two, lay within NEAR of its prediction.
-    """
-    worst: dict[str, list[float]] = {}
-    for point in points:
-        if point.measured and point.predicted_seconds is not None:
-            pairs = (point.seconds, point.predicted_seconds), (point.bytes, point.predicted_bytes)
-            ratios = [a / b if a and b else math.inf for a, b in pairs]
-            worst.setdefault(point.group, []).append(max(max(ratio, 1 / ratio) for ratio in ratios))
-    return {group for group, each in worst.items() if len(each) >= 2 and max(each) <= NEAR}
+def _span(text: Callable[[float], str], value: float, ends: tuple[float, float] | None) -> str:
+    """The text of a value, or of its interval."""
+    if ends is None:
+        return text(value)
+    low, high = (text(end).split() for end in ends)
+    return " ".join([*(low[:1] if low[1] == high[1] else low), "to", *high])
 
 
 def seconds_text(seconds: float, unit: str = "s") -> str:

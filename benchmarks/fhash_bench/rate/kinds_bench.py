@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
+from fhash_bench.rate.fidelity import decibels, gradient, range_of, rms, seams, spectrum_error
 from fhash_bench.rate.kinds import EVERY_GOAL, KINDS, Kind, Settings
 from fhash_bench.rate.measuring import random_regions
 from fhash_bench.rate.peers import PeerFiles, all_filters, spent, there_and_back
@@ -33,7 +34,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import FhashError, InputError, suggestion
 from fhash_formats.series import ArraySeries
 from fhash_formats.support.threads import at_most, usable_threads
-from fhash_formats.support.values import Double, Mask, Values
+from fhash_formats.support.values import Mask, Values
 
 FILTERS = ("SPERR", "SZ3")
 """Peers."""
@@ -45,8 +46,6 @@ BULK_SLACK = 0.1
 """dB that the PSNR of the bulk may miss: the encoder rounds the ends of the bulk."""
 DECODINGS = 3
 """Decodings after each encoding, of which the best counts; most take a few ms."""
-ENERGY = 0.99
-"""Share of a spectrum's energy in the bins that are compared."""
 NOTES = (
     "seconds are those of the processor on one thread, with the array in memory; decoding opens the"
     " file, and the best of 3 counts; region: up to 16 x 16 x 16 vertices of one step of a file"
@@ -58,8 +57,8 @@ NOTES = (
     "bytes of a peer are those of its chunks, one for each frame, at the PSNR that fhash reached or"
     " at the same bound; SZ3 is measured for bounds, and no peer for features and exact values",
     "gradient: PSNR of central differences in space, relative to their range",
-    "spectrum: largest relative error of a bin in the middle step; bins are whole wave numbers, and"
-    " those that hold 99 % of the energy count",
+    "spectrum: largest relative error of a bin in the middle step, after a Hann window; bins are"
+    " whole wave numbers, and those that hold 99 % of the energy count",
     "seams: RMS error in the two planes at each border of tiles over that of all other planes",
 )
 
@@ -369,40 +368,21 @@ def judge(
 ) -> Judged:
     """Quality of a decoded array (t, z, y, x), which NumPy alone computes.
 
-    tiles: length of a tile, first vertex and end of the tiled box, along z, y and x.
+    tiles: see `near_borders`.
     """
     counted = counted_vertices(values, settings)
     frames = np.where(counted, values.astype(np.float64), np.nan)
     errors = decoded - frames
     steep = [(np.fmin.reduce(each), np.fmax.reduce(each)) for each in map(gradient, frames)]
-    near = near_borders(values.shape[1:], tiles)
-    at_borders, elsewhere = (rms(each[part] for each in errors) for part in (near, ~near))
     width, middle = range_of(values), len(values) // 2
     return Judged(
         kept=promise_kept(values, decoded, settings, counted),
         psnr=decibels(width, rms(errors)),
         max_error=float(np.fmax.reduce(np.abs(errors), axis=None)) / width,
         gradient_psnr=decibels(np.nanmax(steep) - np.nanmin(steep), rms(map(gradient, errors))),
-        spectrum_error=spectrum_error(frames[middle], errors[middle]),
-        seams=at_borders / elsewhere if at_borders and elsewhere else None,
+        spectrum_error=spectrum_error(frames[middle], frames[middle] + errors[middle]),
+        seams=seams(errors, tiles),
     )
-
-
-def range_of(values: Values) -> float:
-    """Largest less smallest finite value, in data units."""
-    return float(np.ptp(values[np.isfinite(values)].astype(np.float64)))
-
-
-def rms(parts: Iterable[Double]) -> float:
-    """Root of the mean square of arrays of errors, NaN left out; 0 without errors."""
-    finite = (part[np.isfinite(part)] for part in parts)
-    sums = np.array([(float(np.sum(part**2)), part.size) for part in finite]).sum(axis=0)
-    return math.sqrt(sums[0] / max(sums[1], 1))
-
-
-def decibels(width: float, error: float) -> float | None:
-    """PSNR in dB of an RMS error, relative to a width; None without error."""
-    return 20 * math.log10(width / error) if error else None
 
 
 def counted_vertices(values: Values, settings: Settings) -> Mask:
@@ -431,42 +411,6 @@ def promise_kept(values: Values, decoded: Values, settings: Settings, counted: M
         bulk = errors[(promised >= low) & (promised <= high)]
         needed.append((high - low, bulk, DEFAULT_PSNR_BULK - BULK_SLACK))
     return all((decibels(span, rms([part])) or math.inf) >= psnr for span, part, psnr in needed)
-
-
-def gradient(frame: Double) -> Double:
-    """Central differences of a frame (z, y, x) along each axis of 3 vertices or more, in a row."""
-    turned = [np.moveaxis(frame, axis, 0) for axis in range(3)]
-    return np.concatenate([((each[2:] - each[:-2]) / 2).ravel() for each in turned])
-
-
-def spectrum_error(frame: Double, error: Double) -> float:
-    """Largest relative error of the power spectrum of a frame (z, y, x).
-
-    Power is summed over bins of whole wave numbers, counted along the longest axis, without the
-    mean. The bins with the most power that hold ENERGY of it are compared.
-
-    frame, error: NaN where no vertex is counted, which becomes the mean.
-    """
-    rates = [np.fft.fftfreq(n, 1 / max(frame.shape)) for n in frame.shape]
-    squares = sum(each**2 for each in np.meshgrid(*rates, indexing="ij", sparse=True))
-    bins = np.rint(np.sqrt(squares)).astype(np.int64).ravel()
-    rest = np.nan_to_num(frame - np.nanmean(frame))
-    before, after = (
-        np.bincount(bins, np.abs(np.fft.fftn(each)).ravel() ** 2)[1:]
-        for each in (rest, rest + np.nan_to_num(error))
-    )
-    order = np.argsort(-before)
-    most = order[: np.searchsorted(np.cumsum(before[order]), ENERGY * before.sum()) + 1]
-    return float(np.max(np.abs(after - before)[most] / before[most]))
-
-
-def near_borders(shape: Sequence[int], tiles: Sequence[Sequence[int]]) -> Mask:
-    """Mask (z, y, x) of the two planes at each border between tiles; tiles as in `judge`."""
-    near = np.zeros(shape, np.bool_)
-    for axis, (tile, first, end) in enumerate(tiles):
-        for border in range(first + tile, end, tile):
-            np.moveaxis(near, axis, 0)[border - 1 : border + 1] = True
-    return near
 
 
 class _Run:

@@ -33,31 +33,26 @@ def series() -> ArraySeries:
 
 @pytest.fixture(scope="session")
 def report() -> CostReport:
-    """A report with measured and predicted encodings, reads, pictures, and what was left out."""
+    """A report with encodings, reads, pictures, and what was left out."""
     point = Encoded(
         name="effort 1, 40 dB", codec="default", group="effort 1",
         options="--effort 1 --psnr 40", seconds=0.5, bytes=1000, ratio=20.0, psnr=40.1,
-        psnr_bulk=38.0, max_abs_error=0.1, predicted_seconds=0.4, predicted_bytes=1100,
-        predicted_psnr=40.0, basis="a part", region_ms=3.0,
+        psnr_bulk=38.0, max_abs_error=0.1, region_ms=3.0,
     )  # fmt: skip
     usual = replace(
         point, name=DEFAULT, group="effort 5", options="", seconds=2.0, bytes=900, psnr=50.2,
-        region_ms=7.5,
+        ratio=12.8, region_ms=7.5,
     )  # fmt: skip
     other = replace(
         point, name="SZ3 <tolerance>", codec="SZ3", group="SZ3", options="", bytes=2000, psnr=51.0,
-        predicted_seconds=None,
-    )  # fmt: skip
-    predicted = Encoded(
-        name="effort 5, 50 dB", codec="default", group="effort 5",
-        predicted_seconds=9.0, predicted_bytes=900, predicted_psnr=50.0,
+        region_ms=None,
     )  # fmt: skip
     counters = complete({"rays": 4})
     return CostReport(
         series="a.h5 </script> wave", units="K", dtype="float32", shape=(4, 6, 10, 12),
         measured="the whole series", measured_shape=(4, 6, 10, 12), raw_bytes=11520,
         value_range=(0.0, 1.0), budget_seconds=120.0, seconds=3.0, interrupted=False,
-        encodings=(usual, point, other, predicted),
+        encodings=(usual, point, other),
         curves=(Curve(name="published network, 2 epochs", points=(
             {"seconds": 1.0, "epoch": 1, "psnr": 20.0},
             {"seconds": 2.0, "epoch": 2, "psnr": None},
@@ -77,7 +72,7 @@ def report() -> CostReport:
             Picture(group="encoding", setting=point.name, milliseconds=9.0, counters=counters,
                     psnr=45.0, ssim=0.99),
         ),
-        advice=advise((usual, point, other, predicted), 1.0),
+        advice=advise((usual, point, other), 1.0),
         left_out=(LeftOut(what="SPERR", why="not installed"),),
         machine={"cores": 2}, notes=("a note",),
     )  # fmt: skip

@@ -18,6 +18,8 @@ from fhash_codec.cost.report import (
     LINE,
     NAMES,
     STYLES,
+    Point,
+    _best,
     check_folder,
     encode_panels,
     page,
@@ -30,7 +32,16 @@ from fhash_codec.cost.report import (
     tables,
     write_report,
 )
-from fhash_codec.cost.results import DEFAULT, TRAINING, CostReport, advice_rows
+from fhash_codec.cost.results import (
+    DEFAULT,
+    DEFAULT_OPTIONS,
+    NETWORK,
+    TRAINING,
+    CostReport,
+    LeftOut,
+    advice_rows,
+    conclusion,
+)
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
 
 
@@ -43,26 +54,42 @@ def test_measured_points_and_their_size(report: CostReport) -> None:
         "SZ3": [2000],
     }
     assert frontier.log == "x"
-    areas = {name: points[0].area for name, points in made["answer"].curves.items()}
-    assert areas["effort 5"] < areas["effort 1"] < areas["SZ3"]
     assert "1 kB, 0.5 s, 40.1 dB" in frontier.curves["effort 1"][0].text
-    beside = made["predicted"].curves["effort 1"]
-    assert [point[1:3] for point in beside] == [(0.4, 0.5)]
+    assert (made["answer"].section, frontier.section) == ("", "")
 
 
-@pytest.mark.parametrize(("seconds", "size", "drawn"), [(0.6, 1100, True), (0.8, 1100, False),
-                                                        (0.6, 1600, False)])  # fmt: skip
-def test_predictions_are_drawn_where_those_of_their_effort_held(
-    report: CostReport, seconds: float, size: int, drawn: bool
-) -> None:
-    first = report.encodings[1]
-    second = replace(first, name="second", predicted_seconds=seconds, predicted_bytes=size)
-    wished = replace(first, name="third", seconds=None, predicted_psnr=60.0)
-    (panel, *_) = encode_panels(replace(report, encodings=(first, second, wished)))
-    assert ("effort 1, predicted" in panel.curves) is drawn
-    # One that held may be chance.
-    (panel, *_) = encode_panels(replace(report, encodings=(first, wished)))
-    assert list(panel.curves) == ["effort 1"]
+def test_lines_join_those_alone_than_which_none_is_better(report: CostReport) -> None:
+    (panel, *_) = encode_panels(report)
+    points = [Point("a", x, y, "") for x, y in ((2, 40), (1, 50), (3, 60), (4, 60))]
+    assert [point[1:3] for point in _best(points, panel)] == [(1, 50), (3, 60)]
+
+
+def test_figures_of_a_sample_are_drawn_and_told_as_intervals(report: CostReport) -> None:
+    grown = tuple(each.grown((2.0, 4.0), (3.0, 5.0), 115200) for each in report.encodings)
+    part = replace(report, encodings=grown, measured="a sample", measured_shape=(2, 6, 10, 12))
+    (panel, *_) = encode_panels(part)
+    assert [point.ends for point in panel.curves["effort 5"]] == [(4.0, 8.0)]
+    row = next(row for row in advice_rows(part) if row[1] == "smallest, default")
+    assert row[2:4] == ("4 to 8 s", "2.7 to 4.5 kB")
+    assert "2.6 to 4.3 times smaller: 2.7 to 4.5 kB, 4 to 8 s" in conclusion(part)
+    assert "whole file, 4 x 6 x 10 x 12" in page(part)
+    assert "Measured: a sample, 2 x 6 x 10 x 12" in page(part)
+
+
+def test_rows_name_peers_the_default_and_what_is_wrong(report: CostReport) -> None:
+    usual, *others = report.encodings
+    network = replace(
+        usual, name=NETWORK, codec="published", options="--preset published", bytes=12000,
+        psnr=41.0, missed=True,
+    )  # fmt: skip
+    rows = advice_rows(replace(report, encodings=(usual, *others, network)))
+    assert [row[0] for row in rows] == ["40 dB", "", "", "50 dB", "", ""]
+    assert rows[2][1:] == ("SZ3", "0.5 s", "2 kB", "-", "<tolerance>")
+    assert rows[3][-1] == "default: 50 dB and 40 dB of the bulk"
+    assert rows[4][-1] == "--preset published; misses its promise; larger than the data"
+    late = LeftOut(what=NETWORK, why="stopped after 3 s, its share of the time", late=True)
+    (row,) = [row for row in advice_rows(replace(report, left_out=(late,))) if row[1] == NETWORK]
+    assert row[2:] == ("-", "-", "-", f"--preset published: {late.why}")
 
 
 def test_trainings_stages_and_steps(report: CostReport) -> None:
@@ -88,7 +115,7 @@ def test_what_training_saves_is_told_and_drawn_beside_the_default(report: CostRe
     assert TRAINING not in made["answer"].curves
     assert advice_rows(report)[-3:] == [
         ("training", "none", "1 s", "1.5 kB", "2 ms", "--train none"),
-        ("", "default", "3 s", "900 B", "2 ms", "none"),
+        ("", "default", "3 s", "900 B", "2 ms", DEFAULT_OPTIONS),
         ("", "2s", "6 s", "800 B", "2 ms", "--train 2s"),
     ]
     untold = replace(report, encodings=(usual, *others))
@@ -250,7 +277,7 @@ def test_the_style_loads_nothing(report: CostReport) -> None:
 
 def test_the_answer_stands_before_the_tabs(read: Reader) -> None:
     told = (
-        "The default settings make the data 20.0 times smaller: 900 B, 2 s, 50.2 dB; the smallest"
+        "The default settings make the data 12.8 times smaller: 900 B, 2 s, 50.2 dB; the smallest"
     )
     assert told in read.shown
     assert read.places[0] == "answer"
@@ -297,10 +324,8 @@ def test_rows_fit_their_headers(report: CostReport) -> None:
     made = {table.title.split(",")[0]: table for table in tables(report)}
     assert all(len(row) == len(table.header) for table in made.values() for row in table.rows)
     assert {"Encodings", "Reads", "Pictures", "Left out"} <= set(made)
-    predicted = dict(zip(made["Encodings"].header, made["Encodings"].rows[3], strict=True))
-    assert (predicted["seconds"], predicted["predicted seconds"]) == ("-", "9")
     # A column in which nothing stands says nothing.
-    assert "exact" not in predicted
+    assert not {"exact", "seconds range"} & set(made["Encodings"].header)
     effect = dict(zip(made["Pictures"].header, made["Pictures"].rows[0], strict=True))
     assert (effect["setting"], effect["gradients"]) == ("nothing named", "0")
 

@@ -140,7 +140,6 @@ def test_an_unknown_format_lists_what_is_known(tmp_path: Path) -> None:
         open_series(tmp_path / "a.xyz")
     for reader in REGISTRY:
         assert reader.name in str(caught.value)
-        assert all(suffix in str(caught.value) for suffix in reader.suffixes)
 
 
 @pytest.mark.parametrize(("name", "way"), [("a.fits", "astropy"), ("a.VTU", "ResampleToImage")])
