@@ -54,6 +54,7 @@ RESULTS = {
     "bench table": "fhash_bench.rate.table.RateTable",
     "bench ablate": "fhash_bench.ablate.AblateBench",
     "bench kinds": "fhash_bench.rate.kinds_bench.KindsBench",
+    "bench mine": "fhash_bench.rate.mine.MineBench fhash_bench.commands.mine.PageFile",
     "bench labels": "fhash_bench.labels.LabelReport",
     "bench paper": "fhash_bench.commands.paper.PaperReport",
     "bench paper --parameters": "fhash_bench.commands.paper.Parameters",
@@ -73,7 +74,7 @@ SETTINGS = {
 """Records of settings that users write as files, or find in them."""
 ALSO = """
 AblateBench.rows Against.ratio Beside.ratio BreakEven.ratio BreakEven.pictures CaseResult.holds
-Encoded.measured Finding.holds KindsBench.ratios LabelSize.ratio Playback.ratio RateBench.best_peers
+Encoded.measured Finding.holds KindsBench.ratios LabelSize.ratio MineBench.verdicts Playback.ratio RateBench.best_peers
 RenderBench.summary Switch.ratio
 """
 """Properties and methods of dataclasses whose values stand beside their fields in JSON."""

@@ -394,17 +394,30 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names if len(names) <= 8 else [*names[:6], "...", names[-1]])
 
 
+def feature_rows(
+    report: Mapping[str, Any], features: Sequence[str] = (), dilation: int = 0
+) -> list[tuple[str, str]]:
+    """Rows of the features and of the coreset; none where that is the whole domain."""
+    if report["coreset_fraction"] == 1:
+        return []
+    share = f"{report['coreset_fraction']:.3%} of the domain"
+    rows = [("features", f"{', '.join(features)}; grown by {dilation}")] if features else []
+    return [*rows, ("coreset", f"{share}, in {spans(report['feature_bounding_box'])}")]
+
+
 def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, str]]:
     """Rows of the quality, for `encode`, `diff`, `demo` and `info`.
 
     A container of another writer may lack some figures.
     """
-    exact = report.get("rmse") == 0
+    domain = report.get("psnr_domain")
+    psnr = "exact" if report.get("rmse") == 0 else number(report.get("psnr"), "dB")
+    whole = domain in (None, report.get("psnr"))
     return [
-        ("PSNR, coreset", "exact" if exact else number(report.get("psnr"), "dB")),
+        ("PSNR" if whole else "PSNR, coreset", psnr),
         *_bulk_rows(report),
         *_between_rows(report),
-        ("PSNR, domain", number(report.get("psnr_domain"), "dB")),
+        *([] if whole else [("PSNR, domain", number(domain, "dB"))]),
         ("RMSE", number(report.get("rmse"), units)),
         ("largest error", _largest_error(report.get("max_abs_error"), units)),
         ("SSIM", number(report.get("ssim"), digits=5)),

@@ -130,9 +130,7 @@ def measure_cost(
         with allowance.work("further encodings"):
             if series is not whole:
                 quick = EncodeConfig(features=features, effort=1, psnr=DEFAULT_PSNR)
-                progress("predicting", 0, 1, "")
                 powers = growth_powers(series, facts, quick)
-                progress("predicting", 1, 1, "")
             _encode(own, peers, allowance, features)
         if not allowance.interrupted:
             with allowance.work("further reads and pictures"):
@@ -141,11 +139,11 @@ def measure_cost(
         if allowance.interrupted and not points:
             raise KeyboardInterrupt
         if powers is not None:
-            raw_bytes, vertices = _raw_bytes(whole), prod(whole.shape) / prod(series.shape)
-            own_factors, peer_factors = (growth_factors(powers, n) for n in (scale, vertices))
+            vertices = prod(whole.shape) / prod(series.shape)
             points = [  # a peer encodes all vertices, and not the features alone
-                point.grown(*(own_factors if point.codec in OWN else peer_factors), raw_bytes)
+                point.grown(*growth_factors(powers, n), _raw_bytes(whole))
                 for point in points
+                for n in (scale if point.codec in OWN else vertices,)
             ]
         return report_on(
             whole,

@@ -35,6 +35,7 @@ from fhash_cli.output import (
     emit,
     extent,
     factor,
+    feature_rows,
     loss_rows,
     model_name,
     number,
@@ -42,7 +43,6 @@ from fhash_cli.output import (
     quality_rows,
     say,
     size,
-    spans,
     split_row,
     table,
 )
@@ -422,11 +422,7 @@ def report_rows(report: EncodeReport, units: str, *, part: bool) -> list[tuple[s
         *gain_rows(report),
         ("steps, z, y, x", extent(report["shape"])),
         *([("key frames", str(len(report["key_frames"])))] if published else []),
-        (
-            "coreset",
-            f"{report['coreset_fraction']:.3%} of the domain,"
-            f" in {spans(report['feature_bounding_box'])}",
-        ),
+        *feature_rows(report),
         *quality_rows(report, units),
         ("model", f"{model_name(published=published)}, {size_of_model}"),
         *([] if published else [("MLP", trained(report))]),

@@ -18,6 +18,7 @@ from fhash_cli.output import (
     compared,
     emit,
     extent,
+    feature_rows,
     listed,
     loss_rows,
     model_name,
@@ -25,7 +26,6 @@ from fhash_cli.output import (
     one_line,
     quality_rows,
     size,
-    spans,
     split_row,
     table,
 )
@@ -421,12 +421,7 @@ def _rows(volume: Volume, info: VolumeInfo) -> list[tuple[str, str]]:
         *_source(volume),
         ("t, z, y, x", extent(volume.shape)),
         *((f"  {axis}", positions(volume.coords[axis], axis)) for axis in "tzyx"),
-        ("features", f"{', '.join(info['features'])}; grown by {info['dilation']}"),
-        (
-            "coreset",
-            f"{info['coreset_fraction']:.3%} of the domain,"
-            f" in {spans(info['feature_bounding_box'])}",
-        ),
+        *feature_rows(info, info["features"], info["dilation"]),
         (
             "key frames",
             f"{len(info['key_frames'])}: {listed([str(step) for step in info['key_frames']])}",
