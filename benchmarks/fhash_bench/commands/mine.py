@@ -96,7 +96,7 @@ def mine(
     page = output if output is not None else Path(data).stem + ".mine.html"
     check_plot(page, force, [data])
     with Progress(quiet=quiet) as progress:
-        from fhash_bench.rate.mine import FILTERS, bench_mine
+        from fhash_bench.rate.mine import FILTERS, Wish, bench_mine
         from fhash_bench.rate.mine_page import write_page
 
         names = filters_of(peers, FILTERS)
@@ -104,16 +104,15 @@ def mine(
             if name not in FILTERS:
                 raise InputError(f"{name} has no quality to set; allowed: {', '.join(FILTERS)}")
         with opened(data, source, progress) as series:
-            result, shown = bench_mine(
-                series,
+            wish = Wish(
                 psnr=psnr,
                 isovalue=isovalue,
                 settings=settings,
                 names=names,
                 named=programs_of(peers),
                 budget=budget,
-                progress=progress,
             )
+            result, shown = bench_mine(series, wish, progress)
     save_plot(page, force, partial(write_page, result, shown))
     written: PageFile = {"path": page}
     emit({**written, **result.to_dict()}, _text(result, page), as_json)

@@ -21,9 +21,9 @@ from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
-from fhash_bench.rate.fidelity import decibels, gradient, range_of, rms, seams, spectrum_error
 from fhash_bench.rate.kinds import EVERY_GOAL, KINDS, Kind, Settings
 from fhash_bench.rate.measuring import random_regions
+from fhash_bench.rate.mine import decibels, gradient, range_of, rms, seams, spectrum_error
 from fhash_bench.rate.peers import PeerFiles, all_filters, spent, there_and_back
 from fhash_bench.rate.rate import bench_of
 from fhash_codec.config import DEFAULT_PSNR, DEFAULT_PSNR_BULK

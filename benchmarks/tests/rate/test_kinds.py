@@ -11,13 +11,13 @@ from command_line import Fhash, Refused
 
 import fhash_codec
 from fhash_bench.rate import kinds_bench
-from fhash_bench.rate.fidelity import gradient, near_borders
 from fhash_bench.rate.kinds import KINDS, Settings
 from fhash_bench.rate.kinds_bench import (
     bench_kinds,
     counted_vertices,
     judge,
 )
+from fhash_bench.rate.mine import gradient, near_borders
 from fhash_codec.config import EncodeConfig
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.values import Values

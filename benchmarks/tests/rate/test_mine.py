@@ -12,14 +12,19 @@ import numpy as np
 import pytest
 from command_line import Fhash, Refused
 
-from fhash_bench.rate.fidelity import (
+from fhash_bench.rate.mine import (
+    MEASURES,
+    OWN,
+    MineBench,
+    Shown,
+    Wish,
+    bench_mine,
     extrema_errors,
     fidelity,
     isosurface_distances,
     power_spectrum,
     worst_octave,
 )
-from fhash_bench.rate.mine import MEASURES, OWN, MineBench, Shown, bench_mine
 from fhash_bench.rate.mine_page import figures, page
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import ArraySeries
@@ -90,7 +95,9 @@ def found(field: Field) -> tuple[MineBench, Shown]:
     """A wave with some values missing, beside ZFP, cropped."""
     values = field((4, 16, 40, 48))
     values[:, 0, 5, :9] = np.nan
-    return bench_mine(ArraySeries(values), psnr=45.0, settings=SETTINGS, names=["ZFP"], budget=1e-3)
+    return bench_mine(
+        ArraySeries(values), Wish(psnr=45.0, settings=SETTINGS, names=["ZFP"], budget=1e-3)
+    )
 
 
 def test_a_peer_has_equal_psnr_or_equal_bytes(found: tuple[MineBench, Shown]) -> None:
@@ -129,17 +136,17 @@ def test_missing_peers_are_named_and_others_are_measured(
     series = ArraySeries(field())
     with monkeypatch.context() as old:
         old.delattr("hdf5plugin.Sperr")
-        result, _ = bench_mine(series, settings={"effort": 1}, names=["SPERR", "ZFP"])
+        result, _ = bench_mine(series, Wish(settings={"effort": 1}, names=["SPERR", "ZFP"]))
         assert list(result.of("psnr")) == [OWN, "ZFP"]
         assert "fhash[bench]" in result.refused["SPERR PSNR, a chunk per frame"]
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'fhash\[bench\]'"):
         bench_mine(series)
-    result, _ = bench_mine(series, settings={"effort": 1}, named={"tthresh": tthresh})
+    result, _ = bench_mine(series, Wish(settings={"effort": 1}, named={"tthresh": tthresh}))
     assert list(result.of("psnr")) == [OWN, "TTHRESH"]
     assert "fhash[bench]" in result.refused["SPERR, SZ3, ZFP"]
     with pytest.raises(InputError, match="is constant"):
-        bench_mine(ArraySeries(np.ones((2, 4, 4, 4))), names=(), named={"tthresh": tthresh})
+        bench_mine(ArraySeries(np.ones((2, 4, 4, 4))), Wish(names=(), named={"tthresh": tthresh}))
 
 
 def test_the_command_writes_a_page(
