@@ -74,8 +74,8 @@ SETTINGS = {
 """Records of settings that users write as files, or find in them."""
 ALSO = """
 AblateBench.rows Against.ratio Beside.ratio BreakEven.ratio BreakEven.pictures CaseResult.holds
-Encoded.measured Finding.holds KindsBench.ratios LabelSize.ratio MineBench.verdicts Playback.ratio RateBench.best_peers
-RenderBench.summary Switch.ratio
+Finding.holds KindsBench.ratios LabelSize.ratio MineBench.verdicts Playback.ratio
+RateBench.best_peers RenderBench.summary Switch.ratio
 """
 """Properties and methods of dataclasses whose values stand beside their fields in JSON."""
 ELSEWHERE = """

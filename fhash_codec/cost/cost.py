@@ -77,8 +77,8 @@ NOTES = (
     "pictures by step length, threshold and level of detail are compared with the finest of the"
     " group, those by encoding with the picture of the source",
     "of a sample, seconds and bytes are scaled up to the whole series: in proportion, and by the"
-    " power with which they grew from a quarter of the sample to all of it, at least within a"
-    " factor of 2 of the seconds; its promises refer to the range of the whole",
+    " power with which they grew from a quarter of the sample to all of it, with at least a factor"
+    " of 2 for seconds and below for bytes; its promises refer to the range of the whole",
     "encodings in less than 0.2 s, and those that took longer than a higher PSNR of their effort,"
     " are the fastest of 3 runs, or that time; the smallest is the fastest of those"
     " within 1 % of the fewest bytes, the default the smallest of its effort; each accuracy counts"

@@ -310,16 +310,16 @@ def options_of(config: EncodeConfig) -> str:
     return " ".join(words)
 
 
-TRAININGS = ("none", "2s", "10s")
-"""Values of `--train` that are tried beside the default, where that trains an MLP."""
-
-
 def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
     """Every encoding, in the order in which they are measured: the default settings first."""
 
     def own(effort: int, psnr: float | None = None, error: float | None = None) -> Wish:
         config = EncodeConfig(features=features, effort=effort, psnr=psnr, max_error_rel=error)
         return Wish(codec=config.preset, group=f"effort {effort}", config=config)
+
+    def training(train: str) -> Wish:
+        config = EncodeConfig(features=features, train=train)
+        return Wish(codec=config.preset, group=TRAINING, config=config)
 
     def peers(target: float) -> Iterator[Wish]:
         for name in PEERS:
@@ -330,14 +330,13 @@ def wishes(features: tuple[str, ...] = EVERYTHING) -> Iterator[Wish]:
     yield from (own(1, psnr=target) for target in (60.0, 50.0))
     # A peer takes several times the time that is shown for it, since it is led to its target.
     yield from peers(50.0)
-    for train in TRAININGS:
-        config = EncodeConfig(features=features, train=train)
-        yield Wish(codec=config.preset, group=TRAINING, config=config)
+    yield from map(training, ("none", "2s"))
     # The rows of the advice: the fastest and the default of each, and then what may be smaller.
     yield own(1, psnr=40.0)
     yield from (own(5, psnr=target) for target in (60.0, 40.0))
     network = EncodeConfig(preset="published", features=features)
     yield Wish(codec=network.preset, group=NETWORK, config=network)
+    yield training("10s")
     for target in (60.0, 40.0):
         yield from peers(target)
     for share in (0.01, 0.001):

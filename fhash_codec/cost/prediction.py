@@ -11,8 +11,6 @@ from typing import Annotated, TypedDict
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.probe import (
-    BYTES_WITHIN,
-    SECONDS_WITHIN,
     PaperProbe,
     now,
     part_of,
@@ -129,10 +127,7 @@ def _steps(part: Series, series: Series) -> str:
 
 def _basis(part: Series, series: Series, seconds: float) -> str:
     """The basis of a prediction without the published network, in words."""
-    uncertain = (
-        f"seconds within a factor of {SECONDS_WITHIN:g}, bytes within one of {BYTES_WITHIN:g},"
-        " more often too many"
-    )
+    uncertain = "seconds within a factor of 2, bytes within one of 1.7, more often too many"
     if part is series:
         uncertain = "bytes as they will be, seconds as far as the machine stays as it is"
     return f"an encoding of {_steps(part, series)}, in {seconds:.1f} s; {uncertain}"

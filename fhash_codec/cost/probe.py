@@ -169,11 +169,9 @@ def sample_of(series: Series, vertices: int, around: Box) -> Series:
     return cropped(series, vertices, around)
 
 
-SECONDS_WITHIN = 2.0
-"""Factor within which seconds were in proportion to those of a part, in most of the series that
-tests and benchmarks have."""
-BYTES_WITHIN = 1.7
-"""The same factor of bytes, which were fewer more often than more."""
+WITHIN = 2.0
+"""Factor on growth in proportion within which the seconds of the whole stay, and below which its
+bytes may be: samples of a few steps lack what later steps share with them."""
 SMALLER = 4
 """Vertices of a sample over those of the smaller one to which it is compared."""
 Range = tuple[float, float]
@@ -211,14 +209,14 @@ def growth_factors(powers: tuple[float, float], scale: float) -> tuple[Range, Ra
 
     Bytes grow as from the part to the sample at least, and in proportion at most. Smooth data
     grow less than in proportion: a file of one large part is smaller than those of its pieces.
-    What predictions were off by, SECONDS_WITHIN and BYTES_WITHIN, is always included.
+    The factor WITHIN is always included.
 
     powers: of `growth_powers`. scale: vertices of the whole over those of the sample, 1 or more.
     """
     seconds, sizes = (sorted((max(math.pow(scale, power), 1.0), scale)) for power in powers)
     return (
-        (min(seconds[0], scale / SECONDS_WITHIN), max(seconds[1], scale * SECONDS_WITHIN)),
-        (max(min(sizes[0], scale / BYTES_WITHIN), 1.0), sizes[1]),
+        (min(seconds[0], scale / WITHIN), max(seconds[1], scale * WITHIN)),
+        (max(min(sizes[0], scale / WITHIN), 1.0), sizes[1]),
     )
 
 

@@ -512,9 +512,9 @@ def _function(
     (low, high), scale = value_range, volume.value_range.scale
     if not low < high:
         return without
-    # Whether anything depends on a histogram is tried with a made-up one of one bin.
-    edges = np.linspace(low * scale, high * scale, 9) / scale
-    probe = function_of((edges, np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64)))
+    # Whether anything depends on a histogram is tried with a made-up one.
+    edges = np.linspace(low * scale, high * scale, 97) / scale
+    probe = function_of((edges, np.repeat(np.array([0, 1, 0], dtype=np.int64), 32)))
     if all(
         np.array_equal(one, other)
         for one, other in (

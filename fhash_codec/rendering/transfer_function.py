@@ -59,6 +59,8 @@ EDGE = 0.1
 """Share of an interval's width over which its opacity rises, and falls again."""
 TENT = 0.02
 """Half the width of an isosurface's tent, as a share of the value range."""
+KINDS = 16
+"""Different values up to which they may be labels, whose colours reach over all of them."""
 VISIBLE = 0.02
 """Share of what is visible that lies beyond each end of the colours."""
 CUT = 0.05
@@ -185,7 +187,8 @@ def visible_range(histogram: Histogram, points: Double | None, value_range: Rang
     if points is not None:
         seen = weights * np.interp(edges[:-1] / 2 + edges[1:] / 2, *points.T)
         weights = seen if seen.any() else weights
-    if not weights.any() or not value_range[0] < value_range[1]:
+    few = np.count_nonzero(counts) <= KINDS
+    if few or not weights.any() or not value_range[0] < value_range[1]:
         return value_range
     share = np.cumsum(weights) / weights.sum()
     first, last = np.searchsorted(share, [VISIBLE, 1 - VISIBLE])

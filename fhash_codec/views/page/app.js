@@ -154,13 +154,10 @@ async function count() {
   app.counts.whole = true;
   let lod = 0;
   while (lod < about.levels && ((box[1] - box[0]) * (box[3] - box[2]) * (box[5] - box[4])) / 8 ** lod > COUNTED) lod++;
-  const sum = new Array(BINS).fill(0);
-  for (const step of new Set([0, Math.floor(last / 2), last])) {
-    const frame = await container.frame({ number, step, lod, smoothing: 0 });
-    histogram(frame, [about.low, about.high], BINS).forEach((one, n) => { sum[n] += one; });
-  }
+  const frames = [];
+  for (const step of new Set([0, Math.floor(last / 2), last])) frames.push(await container.frame({ number, step, lod, smoothing: 0 }));
   if (container !== app.container || number !== app.number) return;
-  app.counts = Object.assign(sum, { lod: 0, whole: true });
+  app.counts = Object.assign(histogram(frames, [about.low, about.high], BINS), { lod: 0, whole: true });
   restyle();
 }
 
@@ -207,7 +204,7 @@ function take(frame) {
   const about = variable();
   app.frame = frame;
   if (!app.counts || (app.counts.lod > frame.lod && !app.counts.whole)) {
-    app.counts = histogram(frame, [about.low, about.high], BINS);
+    app.counts = histogram([frame], [about.low, about.high], BINS);
     app.counts.lod = frame.lod;
   }
   if (app.marcher) app.marcher.setFrame(frame);

@@ -35,8 +35,7 @@ from fhash_codec.cost.plan import (
     wishes,
 )
 from fhash_codec.cost.probe import (
-    BYTES_WITHIN,
-    SECONDS_WITHIN,
+    WITHIN,
     growth_factors,
     growth_powers,
     sample_of,
@@ -263,9 +262,9 @@ def test_figures_of_a_sample_become_intervals_of_the_whole() -> None:
 
 def test_a_sample_grows_at_most_in_proportion_and_at_least_as_before() -> None:
     seconds, sizes = growth_factors((0.25, 0.5), 16.0)
-    assert seconds == (2.0, 16 * SECONDS_WITHIN)
+    assert seconds == (2.0, 16 * WITHIN)
     assert sizes == (4.0, 16.0)
-    assert growth_factors((1.0, 1.0), 16.0)[1] == (16 / BYTES_WITHIN, 16.0)
+    assert growth_factors((1.0, 1.0), 16.0)[1] == (16 / WITHIN, 16.0)
 
 
 def test_the_interval_of_a_sample_holds_the_size_of_the_whole(tmp_path: Path) -> None:
