@@ -15,8 +15,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from blocks import blocks
 from click.testing import CliRunner
+from folders import blocks
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {

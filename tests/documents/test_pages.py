@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from blocks import blocks
 from click.testing import CliRunner
+from folders import blocks
 from json_schemas import DOCS
 from reference_pages import commands
 

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from blocks import Block, blocks
+from folders import Block, blocks
 from fresh_install import fhash, run
 
 ROOT = Path(__file__).resolve().parents[2]
