@@ -73,10 +73,10 @@ export class Slices {
   }
 
   draw() {
-    const { frame, grid, tf } = this, low = tf.colours.positions[0], high = tf.colours.positions.at(-1);
+    const { frame, grid, tf } = this, low = tf.slices.positions[0], high = tf.slices.positions.at(-1);
     const lookUp = new Uint8ClampedArray(4 * ENTRIES);
     for (let n = 0; n < ENTRIES; n++) {
-      lookUp.set([...colourAt(tf.colours, low + ((high - low) * n) / (ENTRIES - 1)).map((one) => 255 * one), 255], 4 * n);
+      lookUp.set([...colourAt(tf.slices, low + ((high - low) * n) / (ENTRIES - 1)).map((one) => 255 * one), 255], 4 * n);
     }
     const packed = new Uint32Array(lookUp.buffer);
     for (const { plane, canvas, name, range } of this.panes) {

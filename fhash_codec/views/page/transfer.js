@@ -161,10 +161,11 @@ export const extinctionOf = (opacity, distance) => Math.min(-Math.log1p(-opacity
 export function transferFunction(spec, about) {
   const thin = spec.unit_distance ? [Infinity, Infinity] : about.thin, opacity = spec.opacity ?? "auto";
   const over = (shown) => (spec.nothing ? [[about.range[0], 0]] : Array.isArray(opacity) ? opacity : opacityPoints(opacity, { ...about, shown, thin }));
-  let shown = spec.range ?? shownRange(about.features, about.range), points = over(shown);
+  let shown = spec.range ?? shownRange(about.features, about.range), points = over(shown), sliced = shown;
   if (!spec.range && shown[0] === about.range[0] && shown[1] === about.range[1]) {
     shown = visibleRange(about.counts, Array.isArray(opacity) || ["auto", "feature"].includes(opacity) ? points : null, about.range);
     points = over(shown);
+    sliced = visibleRange(about.counts, null, about.range);
   }
   const colours = colourMap(spec.colours ?? "viridis", shown);
   let [low, high] = about.range;
@@ -175,7 +176,7 @@ export function transferFunction(spec, about) {
     high = Math.min(high, last + 1 < points.length ? points[last + 1][0] : Math.max(points.at(-1)[0], ends[1]));
   }
   if (!(low < high)) [low, high] = [Math.min(low, high), Math.min(low, high) + Math.max(Math.abs(low) * 1e-6, 1e-30)];
-  return { shown, all: about.range, colours, points, span: [low, high], density: spec.density ?? 1, distance: spec.unit_distance ?? about.spacing };
+  return { shown, all: about.range, slices: colourMap(spec.colours ?? "viridis", sliced), colours, points, span: [low, high], density: spec.density ?? 1, distance: spec.unit_distance ?? about.spacing };
 }
 
 /** Colours and opacities of one step of `length`, RGBA float32, at n values spread over the span. */
