@@ -408,7 +408,7 @@ def _row(report: CostReport, what: str, point: Encoded) -> tuple[str, ...]:
 
 
 DEFAULT_OPTIONS = f"default: {DEFAULT_PSNR:g} dB and {DEFAULT_PSNR_BULK:g} dB of the bulk"
-"""What stands for the options of the default settings."""
+"""Text in place of the options of the default settings."""
 
 
 def _network_rows(report: CostReport) -> list[tuple[str, ...]]:

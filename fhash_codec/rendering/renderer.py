@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -152,12 +152,6 @@ MEMORY = 2 << 30
 """Bytes of decoded frames that a renderer keeps by default."""
 BINS = 512
 """Bins of the histogram of a series."""
-RARE = 0.001
-"""Share of the values beyond each end of the histogram, where it is narrowed, at most."""
-CROWDED = 8
-"""Bins that have all but these, from which on it is narrow enough."""
-NARROWINGS = 6
-"""Times that it is counted at most: each narrows it to a 50th at least."""
 COARSE = 2**18
 """Most vertices of a frame that is read for the histogram, where levels of detail allow it."""
 FAINT = 0.01
@@ -515,38 +509,15 @@ def _histogram_of(volume: Volume) -> Histogram:
     last = volume.shape[0] - 1
     # A power of two, 1 for every ordinary range, keeps edges of denormals apart and widths finite.
     scale = volume.value_range.scale
+    edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
+    counts = np.zeros(BINS, dtype=np.int64)
     steps = sorted({0, last // 2, last}) if volume.profile == "compact" else [last // 2]
-    found = []
     for frame in (_coarse(volume, step, COARSE) for step in steps):
         finite = frame[np.isfinite(frame)]
         if scale != 1:  # beyond float64 where the values are not those of the range
             with np.errstate(over="ignore"):
                 finite = finite.astype(np.float64) * scale
-        found.append(finite)
-    low, high = volume.value_range.low * scale, volume.value_range.high * scale
-    return histogram_of(found, low, high, scale)
-
-
-def histogram_of(
-    values: Sequence[npt.NDArray[Any]], low: float, high: float, scale: float = 1.0
-) -> Histogram:
-    """Count values in BINS bins from low to high, or over the part that nearly all of them lie in.
-
-    A rare peak would else leave all values in a few bins. Values beyond the bins count in those at
-    the ends.
-
-    scale: that the edges are divided by.
-    """
-    for _ in range(NARROWINGS):
-        edges = np.linspace(low, high, BINS + 1)
-        counts = np.zeros(BINS, dtype=np.int64)
-        for each in values:
-            counts += np.histogram(np.clip(each, edges[0], edges[-1]), edges)[0]
-        share = np.cumsum(counts) / max(int(counts.sum()), 1)
-        first, last = np.searchsorted(share, [RARE, 1 - RARE])
-        if last - first + 1 > CROWDED or high - low <= 1e-9 * max(abs(low), abs(high)):
-            break
-        low, high = float(edges[max(first - 1, 0)]), float(edges[min(last + 2, BINS)])
+        counts += np.histogram(np.clip(finite, edges[0], edges[-1]), edges)[0]
     return edges / scale, counts
 
 

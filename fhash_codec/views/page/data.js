@@ -1,10 +1,6 @@
 // Frames of a container: read in workers, kept, and read ahead.
 import { interpolate } from "./transfer.js";
 
-const RARE = 0.001;
-const CROWDED = 8;
-const NARROWINGS = 6;
-
 const MEMORY = Math.min((navigator.deviceMemory ?? 4) * 128, 1024) * 2 ** 20;
 const MAX_WORKERS = Math.max(1, Math.min((navigator.hardwareConcurrency ?? 2) - 1, 4));
 
@@ -136,22 +132,14 @@ export class Container {
 
 /** Counts of finite values of a frame in `bins` bins over a range. */
 export function histogram(frames, [low, high], bins) {
-  for (let turn = 1; ; turn++) {
-    const counts = new Array(bins).fill(0), scale = bins / (high - low || 1), width = (high - low) / bins;
-    for (const { values } of frames) {
-      for (let n = 0; n < values.length; n++) {
-        const value = values[n];
-        if (value === value) counts[Math.min(Math.max(Math.floor((value - low) * scale), 0), bins - 1)]++;
-      }
+  const counts = new Array(bins).fill(0), scale = bins / (high - low || 1);
+  for (const { values } of frames) {
+    for (let n = 0; n < values.length; n++) {
+      const value = values[n];
+      if (value === value) counts[Math.min(Math.max(Math.floor((value - low) * scale), 0), bins - 1)]++;
     }
-    // Narrowed where nearly all values lie in a few bins, as histogram_of of fhash_codec/rendering/renderer.py does.
-    const total = Math.max(counts.reduce((sum, one) => sum + one, 0), 1), shares = [];
-    let sum = 0;
-    for (const one of counts) shares.push((sum += one) / total);
-    const first = shares.findIndex((one) => one >= RARE), last = shares.findIndex((one) => one >= 1 - RARE);
-    if (last - first + 1 > CROWDED || high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high)) || turn === NARROWINGS) return Object.assign(counts, { range: [low, high] });
-    [low, high] = [low + Math.max(first - 1, 0) * width, low + Math.min(last + 2, bins) * width];
   }
+  return counts;
 }
 
 /** How different neighbouring vertices look: opacity and, where there is some, place in the colours. */

@@ -101,8 +101,7 @@ export class Editor {
     const most = Math.log1p(Math.max(...counts, 1)), [low, high] = this.range;
     for (let x = 6; x < wide - 6; x++) {
       const share = (x - 6) / (wide - 12), value = low + share * (high - low), colour = colourCode(colourAt(tf.colours, value));
-      const bin = Math.floor(((value - counts.range[0]) / (counts.range[1] - counts.range[0] || 1)) * counts.length);
-      const bar = (Math.log1p(counts[bin] ?? 0) / most) * (inner - 12);
+      const bar = (Math.log1p(counts[Math.min(Math.floor(share * counts.length), counts.length - 1)]) / most) * (inner - 12);
       context.globalAlpha = 0.45;
       context.fillStyle = style.color;
       context.fillRect(x, inner - 6 - bar, 1, bar);

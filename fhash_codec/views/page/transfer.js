@@ -59,15 +59,15 @@ export function shownRange(features, range) {
 /** Values that colours reach over by what is visible (visible_range there). points: null where all count alike. */
 export function visibleRange(counts, points, [low, high]) {
   if (counts.filter(Boolean).length <= KINDS) return [low, high];
-  const [begin, end] = counts.range, width = (end - begin) / counts.length;
-  const seen = counts.map((one, n) => one * (points ? interpolate(points, begin + (n + 0.5) * width) : 1));
+  const width = (high - low) / counts.length;
+  const seen = counts.map((one, n) => one * (points ? interpolate(points, low + (n + 0.5) * width) : 1));
   const weights = seen.some((one) => one > 0) ? seen : counts, total = weights.reduce((sum, one) => sum + one, 0);
   if (!total || !(low < high)) return [low, high];
   const shares = [];
   let sum = 0;
   for (const one of weights) shares.push((sum += one) / total);
   const first = shares.findIndex((one) => one >= VISIBLE), last = shares.findIndex((one) => one >= 1 - VISIBLE);
-  const ends = [begin + first * width, begin + ((last < 0 ? counts.length - 1 : last) + 1) * width];
+  const ends = [low + first * width, low + ((last < 0 ? counts.length - 1 : last) + 1) * width];
   return [ends[0] - low > CUT * (high - low) ? ends[0] : low, high - ends[1] > CUT * (high - low) ? ends[1] : high];
 }
 
@@ -112,8 +112,8 @@ function ofFeatures(texts, range) {
 function awayFromBackground(counts, [low, high]) {
   const total = counts.reduce((sum, one) => sum + one, 0);
   if (!(low < high) || !total) return low < high ? [[low, 0], [high, BACKGROUND]] : [[low, BACKGROUND]];
-  const [begin, end] = counts.range, width = (end - begin) / counts.length;
-  const middle = (n) => begin + (n + 0.5) * width;
+  const width = (high - low) / counts.length;
+  const middle = (n) => low + (n + 0.5) * width;
   const background = middle(counts.indexOf(Math.max(...counts)));
   const order = [...counts.keys()].sort((a, b) => Math.abs(middle(a) - background) - Math.abs(middle(b) - background));
   let sum = 0, half = null, most = null;
