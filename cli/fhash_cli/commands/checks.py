@@ -62,7 +62,7 @@ def verify_command(run: str, variable: str | None, as_json: bool, quiet: bool) -
 @click.command(
     "diff",
     cls=BaseCommand,
-    epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01\nfhash diff before.fhz after.fhz",
+    epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01\nfhash diff demo/vortex.fhz run.fhz",
 )
 @click.argument("data", metavar="DATA|OTHER.fhz", type=click.Path())
 @run_argument
