@@ -62,7 +62,9 @@ def verify_command(run: str, variable: str | None, as_json: bool, quiet: bool) -
 @click.command(
     "diff",
     cls=BaseCommand,
-    epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01\nfhash diff demo/vortex.fhz run.fhz",
+    epilog="fhash diff demo/vortex.h5 run.fhz --max-error 0.01\n"
+    "fhash encode demo/vortex.h5 -o quick.fhz --effort 1\n"
+    "fhash diff quick.fhz run.fhz",
 )
 @click.argument("data", metavar="DATA|OTHER.fhz", type=click.Path())
 @run_argument

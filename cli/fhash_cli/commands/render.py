@@ -631,7 +631,7 @@ class Rendered(TypedDict):
 
 
 @click.command(
-    "render", cls=BaseCommand, epilog="fhash render run.fhz -o last.png --t -1 --effect shading"
+    "render", cls=BaseCommand, epilog="fhash render run.fhz -o last.png --t -1 --effect shadows"
 )
 @run_argument
 @variable_option
