@@ -460,7 +460,8 @@ def conclusion(report: CostReport) -> str:
         and advice.name not in (DEFAULT, NETWORK)
     ]
     parts = [f"The default settings make the data {ratio} times smaller: {told(usual)}"]
-    reached = usual.psnr or math.inf
+    # What the default promises: a peer that keeps it is none of a higher PSNR that the file has.
+    reached = min(usual.psnr or math.inf, DEFAULT_PSNR)
     better = [each for each in points.values() if each.exact or (each.psnr or 0.0) >= reached]
     peer = smallest([each for each in better if each.codec not in OWN])
     if peer is not None:
