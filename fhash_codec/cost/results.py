@@ -460,7 +460,7 @@ def conclusion(report: CostReport) -> str:
         and advice.name not in (DEFAULT, NETWORK)
     ]
     parts = [f"The default settings make the data {ratio} times smaller: {told(usual)}"]
-    # What the default promises: a peer that keeps it is none of a higher PSNR that the file has.
+    # The promise of the default, not the higher PSNR that its file may have.
     reached = min(usual.psnr or math.inf, DEFAULT_PSNR)
     better = [each for each in points.values() if each.exact or (each.psnr or 0.0) >= reached]
     peer = smallest([each for each in better if each.codec not in OWN])
