@@ -175,7 +175,7 @@ class Card:
             if CORESET_ARRAY in arrays or block > 1:
                 stored["coding"] = f"blocks of {block} vertices; {self._in_tiles}"
             return {"shape": list(arrays[BITS_ARRAY].shape[1:]), **stored, "apart": apart}
-        masked = self.container.arrays[TABLE].masked
+        masked = TABLE in arrays and arrays[TABLE].masked
         coding = self._in_tiles if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}
 

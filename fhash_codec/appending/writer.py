@@ -556,8 +556,15 @@ def _packing(metadata: SourceMetadata | None) -> tuple[Any, ...]:
     if metadata is None:
         return ()
     told = metadata.variable_attributes
-    scales = (float(np.ravel(told.get(key, unit))[0]) for key, unit in (*SCALES.items(),))
-    return metadata.stored, *scales
+    return metadata.stored, *(_first_number(told.get(key, unit)) for key, unit in SCALES.items())
+
+
+def _first_number(attribute: Any) -> float | str:
+    """The number of an attribute that may be a list of one; the text of anything else."""
+    numbers = np.ravel(attribute)
+    if numbers.size and isinstance(numbers[0], int | float | np.number):
+        return float(numbers[0])
+    return str(attribute)
 
 
 SCALES = {"scale_factor": 1.0, "add_offset": 0.0}

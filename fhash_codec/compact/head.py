@@ -260,6 +260,8 @@ def _trained(
     coding = replace(attempt.coding, aim=0.0, passes=1, rounds=0)
     coarser = replace(at, step=_step_below(attempt, at.step, gain))
     trained, corrected, done, before = None, list[Single](), list[_Pass](), 0.0
+    if not coarser.step > at.step:
+        return []
     slope = min(max(gain / math.log(coarser.step / at.step), MIN_SLOPE), MAX_SLOPE)
     alone = _Coded.of(parts, coarser, coding)
     promise = (task.goal.psnr or alone.psnr(data_range) + gain) + AIM_OF_MLP

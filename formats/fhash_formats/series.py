@@ -209,8 +209,9 @@ def shown_name(name: str, taken: Collection[str]) -> str:
 def meant(wish: str, names: Collection[str]) -> list[str]:
     """The names that a wish means: the whole of one, else its last parts, "E/x", "x" or E_x."""
     name = wish.strip("/")
-    if name in names:
-        return [name]
+    for whole in (wish, name):
+        if whole in names:
+            return [whole]
     return [
         each
         for each in names

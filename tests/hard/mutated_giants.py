@@ -67,7 +67,7 @@ def _tiles(chance: random.Random, parts: Parts) -> Parts:
     elif chance.random() < 0.5:
         settings = replace(settings, transform=PLAIN.transform)
     settings = replace(settings, head=None)
-    file.header.pop("mlp", None)
+    file.header["mlp"] = None
     metadata = ArrayMetadata(
         shape=tuple(shape),
         dtype=np.dtype(kind),

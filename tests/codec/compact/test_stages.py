@@ -640,3 +640,10 @@ def test_tiny_tiles_are_coded_few_times_where_their_bytes_cannot_be_had(
         fhash_codec.encode(values, tmp_path / "a.fhz", config)
     assert len(passes) <= 4
     assert max(samples) <= FEW_TILES < 600
+
+
+def test_a_promise_below_any_step_needs_no_mlp(tmp_path: Path) -> None:
+    """A step that cannot grow left a division by zero."""
+    values = np.array([[[[-128, 127]]]], np.int8)
+    report = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=0.0))
+    assert report["bytes"] == (tmp_path / "a.fhz").stat().st_size
