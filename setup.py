@@ -208,11 +208,11 @@ class BuildNative(build_ext):
     def _keep_sizes(self) -> None:
         """Write the bytes of each object to build/objects.json: a test holds them to a limit, since
         the time of a compiler is that of the code that it makes."""
-        sizes = {Path(path).name: os.path.getsize(path) for path in self.objects}
         kept = Path("build/objects.json")
-        if not sizes and kept.exists():
-            return  # nothing was compiled
         kept.parent.mkdir(exist_ok=True)
+        sizes = json.loads(kept.read_text("utf-8")) if kept.exists() else {}
+        # An extension whose sources are unchanged was not compiled, and has its sizes from before.
+        sizes |= {Path(path).name: os.path.getsize(path) for path in self.objects}
         kept.write_text(json.dumps(sizes, indent=1), "utf-8")
 
     def _build_with_flags(self) -> None:

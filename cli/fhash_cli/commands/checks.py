@@ -99,21 +99,21 @@ def diff_command(
     positions, are told on stderr.
     """
     import fhash_codec
-    from fhash_codec.comparison import DecodedSeries
     from fhash_codec.volume import open as open_volume
 
-    if data.endswith(".fhz") and not run.endswith(".fhz"):
+    encoded = data.endswith(".fhz")
+    if encoded and not run.endswith(".fhz"):
         raise click.UsageError(f"the data come first: fhash diff {run} {data}")
     variable = _variable_of(run, source)
     with Progress(quiet=quiet) as progress, ExitStack() as stack:
-        if data.endswith(".fhz"):
+        if encoded:
             dataclasses.replace(source, var=None).refuse(data)
-            series = DecodedSeries(stack.enter_context(open_volume(data, variable=variable)))
+            series = stack.enter_context(open_volume(data, variable=variable))
         else:
             series = stack.enter_context(_open(source, data, run, progress))
         report = fhash_codec.diff(series, run, variable=variable, progress=progress)
         fill = None
-        if not source.missing and series.fill is None and not data.endswith(".fhz"):
+        if not encoded and not source.missing and series.fill is None:
             fill = _missing_of(run, variable)
     if fill is not None and not quiet:
         say(f"{run} was encoded with --missing {fill:.9g}; add it here, or it counts as a value")

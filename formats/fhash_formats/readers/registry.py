@@ -299,9 +299,9 @@ def find_reader(path: Path, request: Request) -> Reader:
             return RAW
     if suffix == CONTAINER_SUFFIX or _is_container(path, head):
         raise InputError(f"{path} is encoded already; use: fhash decode {path.name}")
-    for reader in REGISTRY:
-        if reader.matches(head, path):
-            return reader
+    matching = _matching(head, path)
+    if matching is not None:
+        return matching
     for reader in REGISTRY:
         if suffix in reader.suffixes:
             return reader
@@ -315,9 +315,13 @@ def recognised(path: str | Path) -> str | None:
             head = file.read(HEAD_BYTES)
     except OSError:
         return None
-    if not head or head.startswith(zarr_store.ZIP):
-        return None
-    return next((each.name for each in REGISTRY if each.matches(head, Path(path))), None)
+    found = None if head.startswith(zarr_store.ZIP) else _matching(head, Path(path))
+    return None if found is None else found.name
+
+
+def _matching(head: bytes, path: Path) -> Reader | None:
+    """The format that knows the first bytes of a file."""
+    return next((each for each in REGISTRY if each.matches(head, path)), None)
 
 
 ELSEWHERE = {
