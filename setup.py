@@ -38,7 +38,8 @@ DECLARED = {
     "fhash_formats.native": (FORMATS / "fhash.h", FORMATS / "functions.h"),
     "fhash_codec.native": (CODEC / "codec.h",),
     "fhash_codec.native.network": (NETWORK / "network.h",),
-    "fhash_codec.paper.engines.fused": (FUSED / "driver.h", FUSED / "kernels/records.h"),
+    "fhash_codec.cuda": (Path("fhash_codec/cuda/driver.h"),),
+    "fhash_codec.paper.engines.fused": (FUSED / "kernels/records.h",),
 }
 """Packages that call C, and the headers from which their module `declarations` is made."""
 TARGET = os.environ.get("FHASH_TARGET", "")

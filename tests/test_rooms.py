@@ -45,7 +45,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("growing",),
     ),
     "fhash_codec": (
-        ("native", "paraview_reader", "progress", "records"),
+        ("cuda", "native", "paraview_reader", "progress", "records"),
         ("boxes", "config", "devices", "measure"),
         ("features",),
         ("file_info",),

@@ -223,7 +223,7 @@ def machine(run: Run) -> Iterator[Result]:
         "start_device_s": started - imported,
     }
     if run.on_cuda:
-        from fhash_codec.paper.engines.fused.program import find_nvrtc
+        from fhash_codec.cuda.nvrtc import find_nvrtc
 
         nvrtc = find_nvrtc()
         found |= {"nvrtc": f"{nvrtc.path} {nvrtc.version}", "cuda": str(torch.version.cuda)}

@@ -14,13 +14,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines.fused import program
 from fhash_codec.paper.engines.fused.declarations import ffi
 from fhash_codec.paper.engines.fused.program import (
     DeviceLimits,
     Sizes,
-    Unavailable,
     best_of,
     check_layers,
     kernel_sizes,

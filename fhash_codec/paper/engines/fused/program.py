@@ -1,16 +1,11 @@
-"""CUDA program of the fused engine: its source, its compilation and the calls of its kernels."""
+"""CUDA program of the fused engine: its source, for the sizes of one model and one device."""
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import os
-import re
-import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from fhash_codec.cuda.device import Device, Kernels, first_device
+from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines.fused.declarations import ffi
 from fhash_codec.paper.engines.parameters import BETA1, BETA2, WINDOW, axis_matrices
 from fhash_codec.paper.network import Architecture
-from fhash_formats.errors import FhashError
-from fhash_formats.support.files import replacing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,10 +106,6 @@ MAX_INPUTS = 64
 """Largest number of inputs of the layers."""
 MAX_LAYERS = 2
 """Largest number of hidden layers."""
-
-
-class Unavailable(Exception):
-    """The fused kernels cannot do a model, or cannot be had here; the message says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,334 +381,50 @@ def _rows(name: str, columns: int, rows: Sequence[Sequence[int]]) -> str:
     return f"__constant__ int {name}[{max(len(rows), 1)}][{columns}] = {{{values}}};"
 
 
-NAMES = ("libnvrtc.so*", "nvrtc64_*.dll")
-"""Patterns of the library's file name."""
-OPTIONS = ("--std=c++17", "--ptxas-options=-v")
-"""Options of each compilation; the last one has the resources of the kernels reported."""
-
-
-class Nvrtc:
-    """A loaded library.
-
-    Attributes:
-        path: the library's file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Load a library; raises OSError where that fails."""
-        self.path = path
-        # NVRTC loads its other library by name, which finds it only where it is loaded already.
-        for other in sorted(path.parent.glob("libnvrtc-builtins.so*")):
-            _opened(str(other))
-        self._library = _opened(str(path))
-
-    @cached_property
-    def version(self) -> tuple[int, int]:
-        """The version, major and minor."""
-        major, minor = ffi.new("int *"), ffi.new("int *")
-        self._call("nvrtcVersion", major, minor)
-        return major[0], minor[0]
-
-    @cached_property
-    def architectures(self) -> list[int]:
-        """The architectures that it compiles for, as in 90 for sm_90."""
-        count = ffi.new("int *")
-        self._call("nvrtcGetNumSupportedArchs", count)
-        numbers = ffi.new("int[]", count[0])
-        self._call("nvrtcGetSupportedArchs", numbers)
-        return list(numbers)
-
-    def compile(self, text: str, architecture: int) -> tuple[bytes, str]:
-        """Compile CUDA C++ to machine code.
-
-        Args:
-            text: the whole source.
-            architecture: one of `architectures`.
-
-        Returns:
-            The module for the driver (a cubin), and the compiler's messages.
-
-        Raises:
-            Unavailable: the text cannot be compiled.
-        """
-        program = ffi.new("nvrtcProgram *")
-        files = (text.encode(), b"fhash.cu", 0, ffi.NULL, ffi.NULL)
-        self._call("nvrtcCreateProgram", program, *files)
-        try:
-            options = [f"--gpu-architecture=sm_{architecture}", *OPTIONS]
-            array = [ffi.new("char[]", option.encode()) for option in options]
-            answer = self._library.nvrtcCompileProgram(program[0], len(options), array)
-            log = self._bytes(program[0], "ProgramLog").rstrip(b"\0").decode(errors="replace")
-            if answer:
-                raise Unavailable(f"NVRTC {self._error(answer)}:\n{log}")
-            return self._bytes(program[0], "CUBIN"), log
-        finally:
-            self._library.nvrtcDestroyProgram(program)
-
-    def _bytes(self, program: Any, name: str) -> bytes:
-        """Return what nvrtcGetNAME has for a program."""
-        size = ffi.new("size_t *")
-        self._call(f"nvrtcGet{name}Size", program, size)
-        data = ffi.new("char[]", size[0])
-        self._call(f"nvrtcGet{name}", program, data)
-        return bytes(ffi.buffer(data))
-
-    def _call(self, name: str, *arguments: Any) -> None:
-        """Call a function; Unavailable where it fails or the library is too old to have it."""
-        function = getattr(self._library, name, None)
-        if function is None:
-            raise Unavailable(f"NVRTC {self.path} is too old: it has no {name}")
-        if answer := function(*arguments):
-            raise Unavailable(f"NVRTC {self._error(answer)}")
-
-    def _error(self, answer: int) -> str:
-        return str(ffi.string(self._library.nvrtcGetErrorString(answer)).decode())
-
-
-def find_nvrtc() -> Nvrtc:
-    """Return the first NVRTC that loads; Unavailable where there is none."""
-    failures = []
-    for path in _candidates():
-        try:
-            return Nvrtc(path)
-        except OSError as error:
-            failures.append(f"{path}: {error}")
-    reason = "; ".join(failures) or "CUDA builds of torch bring it (libnvrtc)"
-    raise Unavailable(f"no NVRTC was found here: {reason}")
-
-
-def _candidates() -> Iterator[Path]:
-    """Yield files of the library, of a folder the newest first."""
-    for folder in _folders():
-        for pattern in NAMES:
-            found = [path for path in folder.glob(pattern) if "builtins" not in path.name]
-            yield from sorted(found, key=_number, reverse=True)
-
-
-def _folders() -> list[Path]:
-    """Return where the library may be: NVIDIA's packages, torch, a toolkit, the loader's path."""
-    folders = []
-    for package, inner in (("nvidia", ("cu*/lib", "cuda_nvrtc/lib", "*/bin")), ("torch", ("lib",))):
-        spec = importlib.util.find_spec(package)
-        for root in (spec.submodule_search_locations or ()) if spec else ():
-            folders += [folder for pattern in inner for folder in sorted(Path(root).glob(pattern))]
-    toolkits = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), "/usr/local/cuda"]
-    for toolkit in filter(None, toolkits):
-        folders += [Path(toolkit) / "lib64", Path(toolkit) / "bin"]
-    paths = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
-    return folders + [Path(path) for path in paths if path]
-
-
-def _number(path: Path) -> list[int]:
-    """Return the numbers in a file's name, to find the newest."""
-    return [int(number) for number in re.findall(r"\d+", path.name)]
-
-
-LIBRARIES = ("libcuda.so.1", "nvcuda.dll")
-"""Names of the driver's library."""
-MULTIPROCESSORS = 16
-"""Number of the attribute: multiprocessors of a device."""
-CAPABILITY_MAJOR = 75
-"""Number of the attribute: first number of the compute capability."""
-CAPABILITY_MINOR = 76
-"""Number of the attribute: second number of the compute capability."""
-SHARED_PER_MULTIPROCESSOR = 81
-"""Number of the attribute: bytes of shared memory of a multiprocessor."""
-SHARED_PER_BLOCK = 97
-"""Number of the attribute: bytes of shared memory that a block can ask for."""
-DYNAMIC_SHARED = 8
-"""Number of the kernel's attribute: bytes of shared memory that a launch may ask for."""
-LOWEST = 70
-"""Lowest architecture that the kernels run on."""
-
-
-class Driver:
-    """The driver's library; its calls raise Unavailable where they fail."""
-
-    def __init__(self) -> None:
-        """Load and initialise the library."""
-        self._library = _loaded(LIBRARIES)
-        self.call("cuInit", 0)
-
-    def call(self, name: str, *arguments: Any) -> None:
-        """Call a function of the library."""
-        function = getattr(self._library, name, None)
-        if function is None:
-            raise Unavailable(f"the CUDA driver is too old: it has no {name}")
-        if answer := function(*arguments):
-            text = ffi.new("char **")
-            self._library.cuGetErrorString(answer, text)
-            reason = ffi.string(text[0]).decode() if text[0] else f"error {answer}"
-            raise Unavailable(f"{name} of the CUDA driver failed: {reason}")
-
-    def attribute(self, device: int, number: int) -> int:
-        """Return an attribute of a device."""
-        value = ffi.new("int *")
-        self.call("cuDeviceGetAttribute", value, number, device)
-        return int(value[0])
-
-
 class CudaProgram:
-    """Kernels on a CUDA device.
+    """Kernels that are launched after the work that torch has queued.
 
     Attributes:
-        new: whether the kernels were compiled just now, and never ran here before.
+        new: as `Kernels` has it.
     """
 
-    def __init__(
-        self, driver: Driver, cubin: bytes, device: torch.device, threads: int, cached: Path | None
-    ) -> None:
-        """Load a module into the device's primary context; `cached` is its file, if it is new."""
-        self._driver, self._device, self._threads = driver, device, threads
-        self._cached, self.new = cached, cached is not None
-        self._module = ffi.new("CUmodule *")
-        self._kernels: dict[tuple[str, int], Any] = {}
-        self._in_context(driver.call, "cuModuleLoadData", self._module, cubin)
+    def __init__(self, kernels: Kernels, device: torch.device, threads: int) -> None:
+        """Take over the kernels of a device; threads: of a block."""
+        self._kernels, self._device, self._threads = kernels, device, threads
+        self.new = kernels.new
 
     def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
-        """Launch a kernel after the work that torch has queued; Unavailable where that fails.
-
-        arguments: pointers to them.
-        """
-        self._in_context(self._launch, kernel, blocks, shared_bytes, arguments)
+        """Launch a kernel; arguments and errors as in `Kernels.launch`."""
+        stream = torch.cuda.current_stream(self._device).cuda_stream
+        self._kernels.launch(kernel, blocks, self._threads, shared_bytes, arguments, stream)
 
     def forget(self) -> None:
         """Remove the kernels from the cache."""
-        if self._cached is not None:
-            self._cached.unlink(missing_ok=True)
-
-    def _launch(
-        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]
-    ) -> None:
-        """Do what `launch` does, in the device's context."""
-        self._driver.call(
-            "cuLaunchKernel",
-            self._kernel(kernel, shared_bytes),
-            *(blocks, 1, 1, self._threads, 1, 1, shared_bytes),
-            ffi.cast("CUstream", torch.cuda.current_stream(self._device).cuda_stream),
-            list(arguments),
-            ffi.NULL,
-        )
-
-    def _kernel(self, name: str, shared_bytes: int) -> Any:
-        """Return a kernel that may have some bytes of shared memory."""
-        kernel = self._kernels.get((name, shared_bytes))
-        if kernel is None:
-            found, call = ffi.new("CUfunction *"), self._driver.call
-            call("cuModuleGetFunction", found, self._module[0], name.encode())
-            kernel = found[0]
-            call("cuFuncSetAttribute", kernel, DYNAMIC_SHARED, shared_bytes)
-            self._kernels[name, shared_bytes] = kernel
-        return kernel
-
-    def _in_context(self, call: Callable[..., None], *arguments: Any) -> None:
-        """Call a function while the device's primary context is the thread's context."""
-        with torch.cuda.device(self._device):
-            call(*arguments)
+        self._kernels.forget()
 
 
 class CudaDevice:
-    """A CUDA device of torch.
+    """The first CUDA device, with torch beside it.
 
     Attributes:
         limits: its limits.
     """
 
     def __init__(self, device: torch.device) -> None:
-        """Look at a device; Unavailable where the driver cannot be called."""
-        self._driver = Driver()
+        """Look at the device; Unavailable where the driver cannot be called."""
         torch.cuda.init()
-        index = torch.cuda.current_device() if device.index is None else device.index
-        self._device = torch.device("cuda", index)
-        # The first tensor makes the primary context.
-        torch.empty(1, device=self._device)
-        of = self._driver.attribute
-        self._architecture = 10 * of(index, CAPABILITY_MAJOR) + of(index, CAPABILITY_MINOR)
-        self.limits = DeviceLimits(
-            multiprocessors=of(index, MULTIPROCESSORS),
-            shared_per_block=of(index, SHARED_PER_BLOCK),
-            shared_per_multiprocessor=of(index, SHARED_PER_MULTIPROCESSOR),
-        )
+        self._device, self._cuda = device, first_device()
+        self.limits = limits_of(self._cuda)
 
     def load(self, sizes: Sizes) -> CudaProgram:
         """Compile the kernels for some sizes, or find them in the cache."""
-        text, folder = sizes.text(), cache_folder()
-        cubin, file = compiled(text, self._architecture, folder)
-        try:
-            return CudaProgram(self._driver, cubin, self._device, sizes.threads, file)
-        except Unavailable:
-            if file is not None:
-                raise
-        # The file in the cache is damaged.
-        cubin, file = compiled(text, self._architecture, folder, anew=True)
-        return CudaProgram(self._driver, cubin, self._device, sizes.threads, file)
+        return CudaProgram(self._cuda.load(sizes.text()), self._device, sizes.threads)
 
 
-def compiled(
-    text: str, architecture: int, folder: Path, *, anew: bool = False
-) -> tuple[bytes, Path | None]:
-    """Return machine code for a text, from the cache where it was compiled before.
-
-    The name in the cache holds for one text, architecture and version of NVRTC. Where the cache
-    cannot be read or written, each process compiles.
-
-    Args:
-        text: CUDA C++.
-        architecture: as in 90 for sm_90.
-        folder: the cache.
-        anew: whether to compile even if the cache has the machine code.
-
-    Returns:
-        The machine code, and its file in the cache if it was compiled just now.
-
-    Raises:
-        Unavailable: there is no NVRTC, it does not know the architecture, or the text is wrong.
-    """
-    nvrtc = find_nvrtc()
-    # Machine code runs on later devices of the same generation.
-    known = [number for number in nvrtc.architectures if number <= architecture]
-    if not known or max(known) // 10 != architecture // 10 or architecture < LOWEST:
-        raise Unavailable(f"NVRTC {nvrtc.path} cannot compile for sm_{architecture}")
-    target = max(known)
-    major, minor = nvrtc.version
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    file = folder / f"{digest[:32]}-sm_{target}-nvrtc_{major}.{minor}.cubin"
-    if not anew:
-        try:
-            return file.read_bytes(), None
-        except OSError:
-            pass
-    cubin, _ = nvrtc.compile(text, target)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(file, force=True) as temporary:
-            temporary.write_bytes(cubin)
-    except (OSError, FhashError):
-        pass
-    return cubin, file
-
-
-def cache_folder() -> Path:
-    """Return the folder for compiled kernels, in the user's folder for caches."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "fhash" / "kernels"
-
-
-@cache
-def _loaded(names: Sequence[str]) -> Any:
-    """Return the first library of some names that loads; Unavailable where none does."""
-    for name in names:
-        try:
-            return _opened(name)
-        except OSError:
-            continue
-    raise Unavailable(f"the CUDA driver's library is not here ({' or '.join(names)})")
-
-
-@cache
-def _opened(name: str) -> Any:
-    """Return a library, which stays loaded; OSError where it does not load."""
-    return ffi.dlopen(name)
+def limits_of(device: Device) -> DeviceLimits:
+    """Return the limits of a device."""
+    return DeviceLimits(
+        multiprocessors=device.multiprocessors,
+        shared_per_block=device.shared_per_block,
+        shared_per_multiprocessor=device.shared_per_multiprocessor,
+    )

@@ -11,7 +11,8 @@ from typing import Any
 
 import cffi
 
-from fhash_codec.paper.engines.fused.program import DeviceLimits, Sizes, Unavailable
+from fhash_codec.cuda.nvrtc import Unavailable
+from fhash_codec.paper.engines.fused.program import DeviceLimits, Sizes
 from fhash_codec.paper.network import ArrayTable, SparseFrame
 
 HERE = Path(__file__).parent

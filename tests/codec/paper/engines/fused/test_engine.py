@@ -16,6 +16,7 @@ from readable_paper import FHash
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.paper.engines.fused import program as driver
 from fhash_codec.paper.engines.fused.engine import (
     STATE,
@@ -28,7 +29,6 @@ from fhash_codec.paper.engines.fused.engine import (
     start_fused,
     start_points,
 )
-from fhash_codec.paper.engines.fused.program import Unavailable
 from fhash_codec.paper.engines.parameters import LIBRARIES, needed_bytes
 from fhash_codec.paper.model import PointSampler, PointTables
 from fhash_codec.paper.network import Architecture, ArrayTable

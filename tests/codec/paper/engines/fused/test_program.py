@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,22 +11,14 @@ import pytest
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
+from fhash_codec.cuda.nvrtc import Nvrtc, Unavailable, find_nvrtc
 from fhash_codec.paper.engines.fused import engine as points
-from fhash_codec.paper.engines.fused import program as driver_module
-from fhash_codec.paper.engines.fused.declarations import ffi
 from fhash_codec.paper.engines.fused.engine import point_sizes
 from fhash_codec.paper.engines.fused.program import (
     FILES,
     KERNELS,
-    CudaDevice,
-    CudaProgram,
     DeviceLimits,
-    Driver,
-    Nvrtc,
-    Unavailable,
     axis_tables,
-    compiled,
-    find_nvrtc,
     kernel_sizes,
     missed_step_tables,
 )
@@ -72,157 +61,6 @@ def test_missed_steps_sum_up_to_what_adam_catches_up_by(gap) -> None:
         inverse = (powers[i, 1] * weights[first + i, 1]).sum()
         assert factor == pytest.approx(expected.factor[0], rel=1e-5)
         assert EPSILON * factor / inverse == pytest.approx(expected.epsilon[0], rel=1e-5)
-
-
-class FakeNvrtc:
-    """An NVRTC that counts its compilations."""
-
-    path = Path("libnvrtc.so.13")
-    version = (13, 0)
-    architectures = (80, 86, 90)
-
-    def __init__(self) -> None:
-        self.compiled: list[int] = []
-
-    def compile(self, text, architecture):
-        self.compiled.append(architecture)
-        return b"code of " + text.encode(), ""
-
-
-REASON = ffi.new("char[]", b"a reason")
-
-
-class FakeLibrary:
-    """A driver's library that notes its calls, and fails where `failing` says so."""
-
-    def __init__(self, failing: str = "") -> None:
-        self.calls: list[tuple] = []
-        self.failing = failing
-
-    def __getattr__(self, name):
-        def call(*arguments):
-            self.calls.append((name, *arguments))
-            if name == "cuGetErrorString":
-                arguments[1][0] = REASON
-            if name == "cuDeviceGetAttribute":
-                arguments[0][0] = arguments[1]
-            return int(name == self.failing)
-
-        return call
-
-
-@pytest.fixture
-def nvrtc(monkeypatch) -> FakeNvrtc:
-    found = FakeNvrtc()
-    monkeypatch.setattr(driver_module, "find_nvrtc", lambda: found)
-    return found
-
-
-@pytest.fixture
-def library_of(monkeypatch):
-    """A function that puts a FakeLibrary in the driver's place, with torch on its device."""
-
-    @contextmanager
-    def selected(device):
-        yield
-
-    def make(failing: str = "") -> FakeLibrary:
-        library = FakeLibrary(failing)
-        monkeypatch.setattr(driver_module, "_loaded", lambda names: library)
-        return library
-
-    monkeypatch.setattr(torch.cuda, "device", selected)
-    stream = SimpleNamespace(cuda_stream=77)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
-    return make
-
-
-def test_a_text_is_compiled_once_for_each_architecture_and_version(nvrtc, tmp_path) -> None:
-    code, file = compiled("a", 90, tmp_path / "cache")
-    assert code == b"code of a"
-    assert file is not None
-    assert file.read_bytes() == code
-    assert compiled("a", 90, tmp_path / "cache") == (code, None)
-    assert nvrtc.compiled == [90]
-    compiled("b", 90, tmp_path / "cache")
-    compiled("a", 80, tmp_path / "cache")
-    nvrtc.version = (13, 1)
-    compiled("a", 90, tmp_path / "cache")
-    assert nvrtc.compiled == [90, 90, 80, 90]
-    assert len(list((tmp_path / "cache").iterdir())) == 4
-
-
-@pytest.mark.parametrize(("architecture", "target"), [(89, 86), (90, 90), (100, 0), (61, 0)])
-def test_code_is_for_the_device_or_an_earlier_one_of_its_generation(
-    nvrtc, tmp_path, architecture, target
-) -> None:
-    if target:
-        compiled("a", architecture, tmp_path)
-        assert nvrtc.compiled == [target]
-    else:
-        with pytest.raises(Unavailable, match=f"cannot compile for sm_{architecture}"):
-            compiled("a", architecture, tmp_path)
-
-
-def test_a_damaged_file_of_the_cache_is_compiled_anew(
-    nvrtc, library_of, monkeypatch, tmp_path
-) -> None:
-    library = library_of()
-    monkeypatch.setattr(driver_module, "cache_folder", lambda: tmp_path)
-    compiled("a", 90, tmp_path)
-    (file,) = tmp_path.iterdir()
-    file.write_bytes(b"damaged")
-    device = CudaDevice.__new__(CudaDevice)
-    device._driver, device._device, device._architecture = Driver(), torch.device("cuda", 0), 90
-    usual = library.__class__.__getattr__
-
-    def refuse_damaged(self, name):
-        def load(module, code):
-            return int(code == b"damaged")
-
-        return load if name == "cuModuleLoadData" else usual(self, name)
-
-    monkeypatch.setattr(FakeLibrary, "__getattr__", refuse_damaged)
-    program = device.load(SimpleNamespace(text=lambda: "a", threads=256))
-    assert program.new
-    assert nvrtc.compiled == [90, 90]
-    assert file.read_bytes() == b"code of a"
-
-
-def test_a_launch_passes_addresses_of_arguments_and_torchs_stream(library_of, tmp_path) -> None:
-    library, file = library_of(), tmp_path / "code"
-    file.write_bytes(b"code")
-    program = CudaProgram(Driver(), b"code", torch.device("cuda", 0), 256, file)
-    assert program.new
-    arguments = [ffi.new("int *", 5), ffi.new("float *", 2.5)]
-    program.launch("train_bricks", 12, 70_000, arguments)
-    program.launch("train_bricks", 12, 70_000, arguments)
-    names = [name for name, *_ in library.calls]
-    assert names == [
-        "cuInit",
-        "cuModuleLoadData",
-        "cuModuleGetFunction",
-        "cuFuncSetAttribute",
-        "cuLaunchKernel",
-        "cuLaunchKernel",
-    ]
-    assert library.calls[3][2] == 8
-    assert library.calls[3][3] == 70_000
-    _, _, *numbers, stream, addresses, extra = library.calls[-1]
-    assert list(numbers) == [12, 1, 1, 256, 1, 1, 70_000]
-    assert int(ffi.cast("intptr_t", stream)) == 77
-    assert not extra
-    assert addresses[0][0] == 5
-    assert addresses[1][0] == 2.5
-    program.forget()
-    assert not file.exists()
-
-
-@pytest.mark.parametrize("failing", ["cuInit", "cuModuleLoadData", "cuLaunchKernel"])
-def test_failures_of_the_driver_name_the_call_and_its_reason(library_of, failing) -> None:
-    library_of(failing)
-    with pytest.raises(Unavailable, match=f"{failing} of the CUDA driver failed: a reason"):
-        CudaProgram(Driver(), b"code", torch.device("cuda", 0), 256, None).launch("a", 1, 0, [])
 
 
 MAX_REGISTERS = 128
@@ -318,20 +156,6 @@ def test_a_kernel_with_local_memory_is_seen(nvrtc_nvrtc) -> None:
         a[0] = b[n & 511]; }"""
     _, log = nvrtc_nvrtc.compile(text, 90)
     assert re.search(r"[1-9]\d* bytes (stack frame|lmem|cumulative stack)", log), log
-
-
-def test_a_library_is_looked_for_in_nvidias_packages_first(monkeypatch, tmp_path) -> None:
-    """A file that is no library is passed over and named, with the reason."""
-    folder = tmp_path / "nvidia" / "cu13" / "lib"
-    folder.mkdir(parents=True)
-    (folder / "libnvrtc.so.13").write_text("not a library")
-    (folder / "libnvrtc-builtins.so.13.0").write_text("not a library")
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
-    monkeypatch.setattr(
-        "fhash_codec.paper.engines.fused.program._folders", lambda: [folder, tmp_path / "none"]
-    )
-    with pytest.raises(Unavailable, match=re.escape(str(folder / "libnvrtc"))):
-        find_nvrtc()
 
 
 H100 = DeviceLimits(

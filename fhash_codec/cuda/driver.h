@@ -27,3 +27,17 @@ int cuFuncSetAttribute(CUfunction function, int attribute, int value);
 int cuLaunchKernel(CUfunction function, unsigned grid_x, unsigned grid_y, unsigned grid_z,
                    unsigned block_x, unsigned block_y, unsigned block_z, unsigned shared_bytes,
                    CUstream stream, void** parameters, void** extra);
+typedef struct CUctx_st* CUcontext;
+typedef unsigned long long CUdeviceptr;
+int cuDeviceGetCount(int* count);
+int cuDeviceGetName(char* name, int length, int device);
+int cuDevicePrimaryCtxRetain(CUcontext* context, int device);
+int cuCtxPushCurrent_v2(CUcontext context);
+int cuCtxPopCurrent_v2(CUcontext* context);
+int cuCtxSynchronize(void);
+int cuMemGetInfo_v2(size_t* free, size_t* total);
+int cuMemAlloc_v2(CUdeviceptr* address, size_t bytes);
+int cuMemFree_v2(CUdeviceptr address);
+int cuMemcpyHtoD_v2(CUdeviceptr to, const void* from, size_t bytes);
+int cuMemcpyDtoH_v2(void* to, CUdeviceptr from, size_t bytes);
+int cuMemsetD8_v2(CUdeviceptr to, unsigned char value, size_t bytes);
