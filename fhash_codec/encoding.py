@@ -20,7 +20,7 @@ from fhash_codec.compact.goal import missed_promise, remarks
 from fhash_codec.comparison import EncodeReport, Sizes, measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.dataset import Dataset
-from fhash_codec.devices import choose_device
+from fhash_codec.devices import check_cuda
 from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import brief_quality, check_name
 from fhash_codec.paper.encode import encode_paper
@@ -190,8 +190,7 @@ def _opened(source: Source, path: Path, force: bool, config: EncodeConfig) -> It
         with stage("opening", "paths, libraries and the source"):
             check_name(path)
             check_output(path, force)
-            if config.device == "cuda":
-                choose_device(config.device)
+            check_cuda(config.device, torch=config.preset == "published")
             series = stack.enter_context(open_source(source))
         yield series
 
@@ -438,8 +437,7 @@ def _files_of(
     files: list[str | Path] = []
     for name in names:
         config = configs[name]
-        if config.device == "cuda":
-            choose_device(config.device)
+        check_cuda(config.device, torch=config.preset == "published")
         # A function of its own, so that nothing of a variable is held with the next one.
         files += [*_read_from(sources, name), *mask_files(config)]
     return files

@@ -33,7 +33,7 @@ ALLOWED = {
 }
 TORCH_FILES = {
     "fhash_codec": re.compile(
-        r"compact/head_device\.py|paper/engines/fused/.+\.py|devices\.py"
+        r"paper/engines/fused/.+\.py|devices\.py"
         r"|rendering/torch_arrays\.py"
     ),
     "fhash_bench": re.compile(r"(engines|train|paper/(bench|encodings|measures|trained))\.py"),

@@ -28,7 +28,7 @@ for line in sys.stdin:
     print(json.dumps([result.exit_code, result.stdout, result.stderr]))
 assert sys.modules["torch"] is None
 """
-NEEDS = "needs torch: pip install 'fhash[cuda]'"
+NEEDS = "needs torch: pip install 'fhash[torch]'"
 
 
 def run(commands: list[list[str]], folder: Path) -> list[tuple[int, str, str]]:
@@ -68,7 +68,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "bench rate": "bench rate data.npy --target 40 --peer none --no-speed --effort 1 --json",
         "bench render": "bench render run.fhz --part accelerations --turns 1 --size 16 --json",
         "selftest": "selftest --case constant-float32 --case devices --processes 1",
-        "cuda": "render network.fhz -o cuda.png --march arm --device cuda",
+        "published on cuda": "encode data.npy -o c.fhz --preset published --device cuda",
+        "picture on cuda": "render network.fhz -o cuda.png --device cuda",
         "bench train": "bench train data.npy",
         "compact on cuda": "encode data.npy -o cuda.fhz --device cuda",
     }
@@ -93,7 +94,7 @@ def test_the_default_encode_trains_a_head(results: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("command", "what"),
-    [("cuda", "device 'cuda'"), ("bench train", "bench train")],
+    [("published on cuda", "device 'cuda'"), ("bench train", "bench train")],
 )
 def test_what_needs_torch_says_so_in_one_line(
     results: dict[str, Any], command: str, what: str
@@ -104,10 +105,12 @@ def test_what_needs_torch_says_so_in_one_line(
     assert "Traceback" not in errors
 
 
-def test_cuda_needs_torch_with_every_preset(results: dict[str, Any]) -> None:
-    code, _, errors = results["compact on cuda"]
+@pytest.mark.parametrize("command", ["compact on cuda", "picture on cuda"])
+def test_what_needs_a_device_alone_says_so(results: dict[str, Any], command: str) -> None:
+    code, _, errors = results[command]
     assert code == 2
-    assert "device 'cuda' needs torch" in errors
+    assert "there is no CUDA device here; use --device cpu" in errors
+    assert "torch" not in errors
 
 
 def test_a_benchmark_trains_the_network_and_names_no_torch(results: dict[str, Any]) -> None:

@@ -1,152 +1,109 @@
-"""Training of a head by torch, on a CUDA device: the numbers of native/train_head.cpp, bit by bit.
-
-All sums over voxels are of integers below 2**53, which float64 holds whatever their order.
-"""
+"""Training of a head on a CUDA device: the numbers of native/train_head.cpp, bit by bit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.compact.head_training import (
-    BETA1,
-    BETA2,
+    BLOCK_VOXELS,
     ERROR_UNIT,
-    MAX_ERROR,
     Batches,
     Learn,
     Network,
-    as_in_file,
     native_learner,
 )
-from fhash_codec.devices import choose_device
+from fhash_codec.cuda.declarations import ffi
+from fhash_codec.cuda.device import Device, Memory, first_device, sent
+from fhash_codec.cuda.nvrtc import Unavailable
+from fhash_codec.devices import first_line
+from fhash_formats.errors import InputError
 from fhash_formats.support.values import Double
-from fhash_formats.transform.head import INPUTS, MAX_BIAS, MAX_WEIGHT
+from fhash_formats.transform.head import INPUTS
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-# native/train_head.hpp and train_head.cpp have the same numbers.
-INPUT_UNIT = 512.0
-"""Integer steps of an input."""
-ACTIVATION_UNIT = 128.0
-"""Integer steps of an activation."""
-WEIGHT_UNIT = 65536.0
-"""Integer steps of a weight that is not rounded as in the file."""
-MAX_ACTIVATION = 4095.0
-"""Largest magnitude of an activation, in steps."""
-MAX_PARAMETER = 64.0
-"""Largest magnitude of a weight or bias in training."""
-MAX_NORM = 1.0
-"""Length from which on a gradient is shortened."""
-EPSILON = 1e-8
-"""Least divisor of a move, as Adam has it."""
+KERNELS = Path(__file__).parents[1] / "cuda" / "head.cu"
+"""File of the kernels."""
+EACH_ROUNDED = ("--fmad=false",)
+"""Options of their compiler."""
+# head.cu has the same numbers.
+THREADS = 256
+"""Threads of a block."""
+VOXELS = 32
+"""Voxels of a block."""
+GROUPS = 6
+"""Weights and biases of each layer."""
 
 
 def learner_on(device: str) -> Callable[[Batches], Learn]:
     """Return the learner of `train_head` on a device, 'cpu' or 'cuda', with the same bits.
 
-    Raises MissingDependencyError without torch, InputError where there is no such device.
+    It, and what it returns, raise InputError where the kernels cannot run on CUDA.
     """
     if device == "cpu":
         return native_learner
-    return lambda voxels: DeviceLearner(voxels, device).learn
+    with _needed():
+        return partial(device_learner, first_device())
 
 
-class DeviceLearner:
-    """Updates of a network by batches that lie on a device."""
+def device_learner(device: Device, voxels: Batches) -> Learn:
+    """Return what learns from some batches by the kernels of a device.
 
-    def __init__(self, voxels: Batches, device: str) -> None:
-        """Send the batches to a device, as `choose_device` has it."""
-        import torch
+    The host queues two launches for each update, and waits once for all.
+    """
+    with _needed():
+        kernels = device.load(KERNELS.read_text(encoding="utf-8"), options=EACH_ROUNDED)
+    arrays = voxels.inputs, voxels.targets, voxels.lowest, voxels.highest, voxels.weights
+    on_device = [sent(device, array) for array in arrays]
+    batches, blocks = voxels.inputs.shape[:2]
 
-        self._torch, self._device = torch, choose_device(device)
-        self._voxels = {name: self._sent(array) for name, array in vars(voxels).items()}
-        self._batches = len(voxels)
+    @cache
+    def held(number: int) -> tuple[Memory, Memory]:
+        """The state of a network with some parameters, and the sums of its slopes."""
+        return device.memory(24 * number), device.memory(16 * number)
 
-    def learn(
-        self, network: Network, first: int, rates: Double, roots: Double, rounded: bool
-    ) -> None:
-        """Do some updates, as a `Learn`."""
-        for update, (rate, root) in enumerate(zip(rates, roots, strict=True), start=first):
-            slopes = self._gradient(network, update % self._batches, rounded=rounded)
-            _adam_step(network, slopes, float(rate), float(root))
+    def learn(network: Network, first: int, rates: Double, roots: Double, rounded: bool) -> None:
+        number = len(network.parameters)
+        numbers = np.stack([network.parameters, network.means, network.squares])
+        state, sums = held(number)
+        state.send(numbers)
+        sums.clear()
+        voxels_at = [ffi.new("CUdeviceptr *", memory.address) for memory in on_device]
+        state_at, sums_at = (ffi.new("CUdeviceptr *", memory.address) for memory in (state, sums))
+        widths = [ffi.new("int *", width) for width in network.widths]
+        count, as_in_file, update = (ffi.new("int *", n) for n in (batches, rounded, first))
+        per_voxel = ffi.new("double *", 2 / (ERROR_UNIT * blocks * BLOCK_VOXELS))
+        rate, root = ffi.new("double *"), ffi.new("double *")
+        slopes = (*voxels_at, state_at, sums_at, count, *widths, as_in_file, update)
+        step = (state_at, sums_at, *widths, update, per_voxel, rate, root)
+        tiles, tile_bytes = blocks * BLOCK_VOXELS // VOXELS, _tile_bytes(network.widths)
+        parts, norm_bytes = -(-number // THREADS), 8 * (number + THREADS)
+        for update[0], (rate[0], root[0]) in enumerate(zip(rates, roots, strict=True), first):
+            kernels.launch("head_slopes", tiles, THREADS, tile_bytes, slopes)
+            kernels.launch("head_step", parts, THREADS, norm_bytes, step)
+        state.receive(numbers)
+        network.parameters[:], network.means[:], network.squares[:] = numbers
 
-    def _gradient(self, network: Network, batch: int, *, rounded: bool) -> Double:
-        """Return the gradient of the mean squared error of a batch."""
-        inputs = self._voxels["inputs"][batch].double().permute(1, 0, 2).reshape(INPUTS, -1)
-        layers = [self._layer(*layer, rounded=rounded) for layer in network.parts()]
-        (one, scale_1, bias_1), (two, scale_2, bias_2), (three, scale_3, bias_3) = layers
-        first = _activated(one @ inputs, scale_1 * (ACTIVATION_UNIT / INPUT_UNIT), bias_1)
-        second = _activated(two @ first, scale_2, bias_2)
-        outputs = three @ second * (scale_3 * (ERROR_UNIT / ACTIVATION_UNIT)) + bias_3 * ERROR_UNIT
-        slopes_3 = self._slopes(outputs.round(), batch)
-        slopes_2 = _descended(three.T @ slopes_3, scale_3, second)
-        slopes_1 = _descended(two.T @ slopes_2, scale_2, first)
-        per_voxel = 2 / (ERROR_UNIT * inputs.shape[1])
-        pairs = (slopes_1, inputs), (slopes_2, first), (slopes_3, second)
-        units = INPUT_UNIT, ACTIVATION_UNIT, ACTIVATION_UNIT
-        sums = [
-            part
-            for (slopes, values), unit in zip(pairs, units, strict=True)
-            for part in (
-                (slopes @ values.T * (per_voxel / unit)).reshape(-1),
-                slopes.sum(dim=1) * per_voxel,
-            )
-        ]
-        gradient: Double = self._torch.cat(sums).cpu().numpy()
-        return gradient
-
-    def _layer(
-        self, weights: Double, biases: Double, *, rounded: bool
-    ) -> tuple[Tensor, float, Tensor]:
-        """Return a layer's integers (out, in), their unit, and its biases (out, 1)."""
-        if rounded:
-            integers, scale = as_in_file(weights, MAX_WEIGHT)
-            of_biases, unit = as_in_file(biases, MAX_BIAS)
-            used = of_biases.astype(np.float64) * unit
-        else:
-            most, scale = WEIGHT_UNIT * MAX_PARAMETER, 1 / WEIGHT_UNIT
-            integers, used = np.clip(np.rint(weights * WEIGHT_UNIT), -most, most), biases
-        return (
-            self._sent(integers.astype(np.float64)),
-            scale,
-            self._sent(used.copy()[:, np.newaxis]),
-        )
-
-    def _slopes(self, outputs: Tensor, batch: int) -> Tensor:
-        """Return the slopes (1, n) of rounded outputs; 0 for one beyond the range of values."""
-        of = {name: array[batch].double() for name, array in self._voxels.items()}
-        useful = outputs.maximum(of["lowest"]).minimum(of["highest"])
-        errors = (useful - of["targets"]).clamp(-MAX_ERROR, MAX_ERROR)
-        weighted = (errors * of["weights"]).round()
-        return self._torch.where(useful == outputs, weighted, 0.0)
-
-    def _sent(self, array: npt.NDArray[Any]) -> Tensor:
-        return self._torch.from_numpy(array).to(self._device)
+    return _needed()(learn)
 
 
-def _activated(sums: Tensor, scale: float, biases: Tensor) -> Tensor:
-    """Return the activations of sums: leaky, clipped, rounded half to even."""
-    values = sums * scale + biases * ACTIVATION_UNIT
-    return (values * 0.125).maximum(values).clamp(-MAX_ACTIVATION, MAX_ACTIVATION).round()
+@contextmanager
+def _needed() -> Iterator[None]:
+    """Raise InputError where CUDA fails while the context lasts."""
+    try:
+        yield
+    except Unavailable as error:
+        raise InputError(f"device is 'cuda', but {first_line(error)}; use --device cpu") from error
 
 
-def _descended(slopes: Tensor, scale: float, activations: Tensor) -> Tensor:
-    """Return the slopes of sums from those of activations."""
-    leaky = (activations > 0) * 0.875 + 0.125
-    return (slopes * scale * leaky).clamp(-MAX_ERROR, MAX_ERROR).round()
-
-
-def _adam_step(network: Network, gradient: Double, rate: float, root: float) -> None:
-    """Do one step of Adam along a gradient, shortened to MAX_NORM."""
-    # One after the other, as the native code adds them up.
-    norm = float(np.sqrt(np.add.accumulate(gradient * gradient)[-1]))
-    slopes = gradient * (MAX_NORM / norm if norm > MAX_NORM else 1.0)
-    network.means += (slopes - network.means) * (1 - BETA1)
-    network.squares += (slopes * slopes - network.squares) * (1 - BETA2)
-    moves = rate * network.means / (np.sqrt(network.squares) * root + EPSILON)
-    np.clip(network.parameters - moves, -MAX_PARAMETER, MAX_PARAMETER, out=network.parameters)
+def _tile_bytes(widths: tuple[int, int]) -> int:
+    """Return the bytes of `Tile` in head.cu."""
+    first, second = widths
+    quads = [-(-width // 4) for width in widths]
+    weights = INPUTS * quads[0] + first * quads[1] + second * quads[0]
+    doubles = first + second + 1 + GROUPS + GROUPS * 32
+    rows = INPUTS + 1 + first + 1 + second + 1 + first + second + 1
+    return 16 * weights + 8 * doubles + 4 * (second + rows * (VOXELS + 1))

@@ -91,6 +91,10 @@ typedef struct FhashMarch {
     const int64_t* network_levels;
     const int64_t* network_layers;
     int64_t network_path;
+    int64_t network_shape[3];    // z, y, x: of `values`, which have the vertices of its box
+    const double* network_x;     // place of each vertex of the frame along an axis among those of
+    const double* network_y;     // its box; null where they are the same
+    const double* network_z;
     int64_t network_whole;       // whether there is a value at all places of the frame
     double network_low, network_span;  // the value of its 0, and the change to that of its 1
     int64_t* network_status;           // takes what it returns where it fails

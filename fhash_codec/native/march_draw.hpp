@@ -135,8 +135,8 @@ FHASH_INLINE void Packet::march(Counters& counted) {
     for (int since = 0;;) {
         int state = skipping ? skip(counted) : alive();
         while (m.ready && fetch()) state = skipping ? skip(counted) : alive();
-        if (!state) break;
-        if (!(state & 1)) continue;
+        if (!of_any(state)) break;
+        if (!of_any(state & 1)) continue;
         counted.passes++;
         Seen seen;
         take(counted, seen);
@@ -162,7 +162,7 @@ FHASH_INLINE void Packet::march(Counters& counted) {
 // Add the rays to the pictures, from this pixel on.
 FHASH_INLINE void Packet::write(int64_t x, int64_t y) {
     const double share = 1.0 / (double)(m.rays * m.rays);
-    alignas(64) float shares[N][4];
+    FHASH_LANES float shares[N][4];
     #pragma omp simd
     for (int l = 0; l < N; l++) {
         shares[l][0] = (float)(red[l] * share);
@@ -189,8 +189,9 @@ FHASH_INLINE void Packet::write(int64_t x, int64_t y) {
 
 }  // namespace
 
+#if !defined(FHASH_CUDA)
 // March the tiles from first to stop, in rows of the picture.
-void FHASH_MARCH(const FhashMarch& m, int flags, std::int64_t first, std::int64_t stop,
+void FHASH_MARCH(const FhashInput& m, int flags, std::int64_t first, std::int64_t stop,
                  std::int64_t* counters) {
     const std::int64_t across = (m.width + TILE - 1) / TILE;
     Counters counted;
@@ -209,3 +210,4 @@ void FHASH_MARCH(const FhashMarch& m, int flags, std::int64_t first, std::int64_
     }
     counted.add_to(counters);
 }
+#endif

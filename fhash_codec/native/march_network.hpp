@@ -10,11 +10,22 @@
 
 namespace {
 
+// Whether the network has a value at a place within the frame.
+FHASH_INLINE bool known_at(const FhashInput& m, float x, float y, float z) {
+    if (m.network_whole) return true;
+    double at[3] = {x, y, z}, rates[3];
+    to_box(m, at, rates);
+    const float there =
+        value_at(m.network_shape, m.values, (float)at[0], (float)at[1], (float)at[2]);
+    return there == there;
+}
+
+#if !defined(FHASH_CUDA)
 // Evaluate the network at the next samples of all rays, the nearest first, where the frame says
 // that there is a value.
 void Packet::look_ahead(Counters& counted) {
     FhashPoints points;
-    int ray[FHASH_POINTS], sample[FHASH_POINTS];
+    int ray[POINTS], sample[POINTS];
     for (int l = 0; l < N; l++) {
         const int gone = k[l] - begun[l];
         begun[l] = k[l];
@@ -23,18 +34,15 @@ void Packet::look_ahead(Counters& counted) {
         held[l] >>= gone;
         for (int j = 0; j + gone < AHEAD; j++) ahead[l][j] = ahead[l][j + gone];
     }
-    for (int j = 0; j < AHEAD && points.count < FHASH_POINTS; j++)
-        for (int l = 0; l < N && points.count < FHASH_POINTS; l++) {
+    for (int j = 0; j < AHEAD && points.count < POINTS; j++)
+        for (int l = 0; l < N && points.count < POINTS; l++) {
             if (k[l] + j >= count[l] || (held[l] >> j & 1) || (j == 0 && !on[l])) continue;
             if (j > 0 && m.distance && !visible(l, k[l] + j)) continue;
             const float f = min((float)(k[l] + j), farthest[l]);
             const float x = clamp(ox[l] + f * dx[l], low[0], high[0]);
             const float y = clamp(oy[l] + f * dy[l], low[1], high[1]);
             const float z = clamp(oz[l] + f * dz[l], low[2], high[2]);
-            if (!m.network_whole) {
-                const float there = value_at(m, m.values, x, y, z);
-                if (!(there == there)) continue;
-            }
+            if (!known_at(m, x, y, z)) continue;
             ray[points.count] = l;
             sample[points.count] = j;
             points.add(x, y, z);
@@ -46,6 +54,37 @@ void Packet::look_ahead(Counters& counted) {
         held[ray[i]] |= 1u << sample[i];
     }
 }
+#else
+// The same by a warp: as many samples of each ray that lacks one as there are threads for.
+void Packet::look_ahead(Counters& counted) {
+    constexpr unsigned ALL = 0xffffffffu;
+    const unsigned lane = threadIdx.x % 32;
+    const bool lacks = on[0] && value[0] == value[0] &&
+                       !(k[0] - begun[0] < AHEAD && held[0] >> (k[0] - begun[0]) & 1);
+    const unsigned rays = __ballot_sync(ALL, lacks);
+    const unsigned alive = __popc(rays), each = min(32 / alive, (unsigned)AHEAD);
+    unsigned others = rays;
+    for (unsigned n = 0; n < lane / each && n < alive - 1; n++) others &= others - 1;
+    const int ray = __ffs(others) - 1, sample = (int)(lane % each);
+    const auto of_ray = [&](auto number) { return __shfl_sync(ALL, number, ray); };
+    const int at_sample = of_ray(k[0]) + sample, end = of_ray(count[0]);
+    const float f = min((float)at_sample, of_ray(farthest[0]));
+    const float x = clamp(of_ray(ox[0]) + f * of_ray(dx[0]), low[0], high[0]);
+    const float y = clamp(of_ray(oy[0]) + f * of_ray(dy[0]), low[1], high[1]);
+    const float z = clamp(of_ray(oz[0]) + f * of_ray(dz[0]), low[2], high[2]);
+    FhashPoints points;
+    if (lane / each < alive && at_sample < end && known_at(m, x, y, z)) points.add(x, y, z);
+    points.evaluate(m, false);
+    counted.evaluations += points.count;
+    const unsigned found = __ballot_sync(ALL, points.count);
+    const unsigned first = each * __popc(rays & ((1u << lane) - 1));
+    for (unsigned j = 0; j < each; j++) {
+        const float there = __shfl_sync(ALL, points.values[0], (first + j) % 32);
+        if (lacks) ahead[0][j] = there;
+    }
+    if (lacks) begun[0] = k[0], held[0] = found >> first & ((2u << (each - 1)) - 1);
+}
+#endif
 
 // `sample` for a network.
 void Packet::sample_network(Counters& counted, Seen& seen) {
@@ -57,12 +96,12 @@ void Packet::sample_network(Counters& counted, Seen& seen) {
         px[l] = clamp(ox[l] + f * dx[l], low[0], high[0]);
         py[l] = clamp(oy[l] + f * dy[l], low[1], high[1]);
         pz[l] = clamp(oz[l] + f * dz[l], low[2], high[2]);
-        value[l] = m.network_whole ? 0.f : value_at(m, m.values, px[l], py[l], pz[l]);
+        value[l] = known_at(m, px[l], py[l], pz[l]) ? 0.f : NONE;
         const int j = k[l] - begun[l];
         const bool there = j >= 0 && j < AHEAD && (held[l] >> j & 1);
         wanting |= on[l] && value[l] == value[l] && !there;
     }
-    if (wanting) look_ahead(counted);
+    if (of_any(wanting)) look_ahead(counted);
     for (int l = 0; l < N; l++) {
         counted.samples += on[l];
         const int j = k[l] - begun[l];
@@ -115,8 +154,7 @@ void Packet::central_slopes_of_network() {
             for (const float move : {1.f, -1.f}) {
                 float place[3] = {px[l], py[l], pz[l]};
                 place[c] = clamp(place[c] + move, 0.f, (float)(m.shape[2 - c] - 1));
-                const float there = value_at(m, m.values, place[0], place[1], place[2]);
-                lost[l] |= !(there == there);
+                lost[l] |= !known_at(m, place[0], place[1], place[2]);
                 ray[points.count] = l;
                 points.add(place[0], place[1], place[2]);
             }

@@ -12,20 +12,20 @@ namespace {
 using std::int32_t;
 using std::int64_t;
 
-// By value and always inlined. The functions of the standard library are not vectorised, and not
-// inlined into functions for other machines.
-template <class T> FHASH_INLINE T min(T a, T b) { return b < a ? b : a; }
-template <class T> FHASH_INLINE T max(T a, T b) { return a < b ? b : a; }
-// What is not a number becomes the lower end.
-template <class T> FHASH_INLINE T clamp(T x, T low, T high) {
-    const T least = x > low ? x : low;
-    return least < high ? least : high;
-}
-
 FHASH_INLINE float known_or_zero(double slope) { return slope == slope ? (float)slope : 0.f; }
 
+#if defined(FHASH_CUDA)
+constexpr int SIDE = 1;  // a packet of one ray for each thread
+#define FHASH_LANES
+// Whether something holds for any ray of a warp, which marches in step: packets that end, and
+// networks that are evaluated together.
+FHASH_INLINE int of_any(int holds) { return __any_sync(0xffffffffu, holds); }
+#else
 constexpr int SIDE = 4;   // rays along a packet's side
-constexpr int N = 16;     // rays of a packet
+#define FHASH_LANES alignas(64)
+FHASH_INLINE int of_any(int holds) { return holds; }
+#endif
+constexpr int N = SIDE * SIDE;  // rays of a packet
 constexpr int TILE = 16;  // pixels along a tile's side
 constexpr int BLOCK = 32; // samples whose opacity is summed in single precision
 constexpr int AHEAD = 16; // samples of a ray at which a network may be evaluated ahead
@@ -46,9 +46,15 @@ enum Taken { OPACITIES, GRADIENTS, LARGEST };
 // By what rays leap: bricks that do not matter, these and cells, or bricks below the largest value.
 enum Leaps { BY_BRICKS, BY_CELLS, BY_LARGEST };
 
-const double ENDLESS = std::numeric_limits<double>::infinity();
-const float NONE = std::numeric_limits<float>::quiet_NaN();
-const float FAR = std::numeric_limits<float>::infinity();
+#if defined(FHASH_CUDA)  // NVRTC has none of these as constants
+#define ENDLESS __longlong_as_double(0x7ff0000000000000LL)
+#define NONE __int_as_float(0x7fffffff)
+#define FAR __int_as_float(0x7f800000)
+#else
+constexpr double ENDLESS = std::numeric_limits<double>::infinity();
+constexpr float NONE = std::numeric_limits<float>::quiet_NaN();
+constexpr float FAR = std::numeric_limits<float>::infinity();
+#endif
 
 struct Counters {
     int64_t rays = 0, passes = 0, samples = 0, gradients = 0, skips = 0, evaluations = 0;
@@ -84,7 +90,7 @@ struct Phong {
     float ambient, diffuse, specular, steep;
     float floor;  // the square of that of the march
     const float* powers;
-    explicit Phong(const FhashMarch& m)
+    explicit Phong(const FhashInput& m)
         : ambient((float)m.ambient), diffuse((float)m.diffuse), specular((float)m.specular),
           steep((float)m.steep), floor((float)(m.floor * m.floor)),
           powers(m.powers) {}
@@ -92,64 +98,80 @@ struct Phong {
 
 struct Lines;
 
+// Whether the frame has values in all of the drawn box.
+inline bool is_whole(const FhashInput& m) {
+    bool same = true;
+    for (int c = 0; c < 3; c++)
+        for (int end = 0; end < 2; end++) same &= m.box[c][end] == m.seen[c][end];
+    return same;
+}
+
 // 16 rays, and how far they are. In single precision what vectors work on, in double precision what
 // is worked on for single rays.
 struct Packet {
-    const FhashMarch& m;
+    const FhashInput& m;
+#if defined(FHASH_CUDA)
+    static constexpr int flags = FHASH_FLAGS;
+#else
     const int flags;
+#endif
     const Phong phong;
     // The lines of the rays.
-    alignas(64) float ox[N], oy[N], oz[N];        // place of sample 0
-    alignas(64) float dx[N], dy[N], dz[N];        // from a sample to the next
-    alignas(64) float ix[N], iy[N], iz[N];        // samples per vertex
-    alignas(64) float farx[N], fary[N], farz[N];  // much, where it does not move along an axis
-    alignas(64) int upx[N], upy[N], upz[N];       // whether it ascends
-    alignas(64) float tox[N], toy[N], toz[N];     // towards the light
-    alignas(64) float hx[N], hy[N], hz[N];        // halfway between the light and the eye
+    FHASH_LANES float ox[N], oy[N], oz[N];        // place of sample 0
+    FHASH_LANES float dx[N], dy[N], dz[N];        // from a sample to the next
+    FHASH_LANES float ix[N], iy[N], iz[N];        // samples per vertex
+    FHASH_LANES float farx[N], fary[N], farz[N];  // much, where it does not move along an axis
+    FHASH_LANES int upx[N], upy[N], upz[N];       // whether it ascends
+    FHASH_LANES float tox[N], toy[N], toz[N];     // towards the light
+    FHASH_LANES float hx[N], hy[N], hz[N];        // halfway between the light and the eye
     // What was seen.
-    alignas(64) float r[N], g[N], b[N], a[N];  // colours and opacity of this block of samples
-    alignas(64) float left[N];                 // light behind the blocks before
-    alignas(64) float depth[N];
-    alignas(64) float previous[N];  // value of the place before the sample, for surfaces; or NONE
+    FHASH_LANES float r[N], g[N], b[N], a[N];  // colours and opacity of this block of samples
+    FHASH_LANES float left[N];                 // light behind the blocks before
+    FHASH_LANES float depth[N];
+    FHASH_LANES float previous[N];  // value of the place before the sample, for surfaces; or NONE
     // The samples of this pass.
-    alignas(64) float gx[N], gy[N], gz[N];  // gradients
-    alignas(64) float at[N];                // entries of the table
-    alignas(64) float value[N], alpha[N];
-    alignas(64) float px[N], py[N], pz[N];  // places
-    alignas(64) float farthest[N];          // sample behind which none is taken, with planes
-    alignas(64) float best[N];              // largest value so far
-    alignas(64) float cr[N], cg[N], cb[N];  // colours, where sampled by AVX-512
+    FHASH_LANES float gx[N], gy[N], gz[N];  // gradients
+    FHASH_LANES float at[N];                // entries of the table
+    FHASH_LANES float value[N], alpha[N];
+    FHASH_LANES float px[N], py[N], pz[N];  // places
+    FHASH_LANES float farthest[N];          // sample behind which none is taken, with planes
+    FHASH_LANES float best[N];              // largest value so far
+    FHASH_LANES float cr[N], cg[N], cb[N];  // colours, where sampled by AVX-512
     // Numbers of samples.
-    alignas(64) int k[N];         // the next one
-    alignas(64) int count[N];     // of all
-    alignas(64) int last[N];      // the one of the shorter step
-    alignas(64) int on[N];        // whether the ray takes part in this pass
-    alignas(64) int where[N];     // of the largest value
-    alignas(64) int quitting[N];  // whether the sample is the last before a gap, for surfaces
+    FHASH_LANES int k[N];         // the next one
+    FHASH_LANES int count[N];     // of all
+    FHASH_LANES int last[N];      // the one of the shorter step
+    FHASH_LANES int on[N];        // whether the ray takes part in this pass
+    FHASH_LANES int where[N];     // of the largest value
+    FHASH_LANES int quitting[N];  // whether the sample is the last before a gap, for surfaces
     // Values of a network at the samples from `begun` on; bits of `held` say at which of them.
     float ahead[N][AHEAD];
     int begun[N];
     unsigned held[N];
     // The same in double precision.
-    alignas(64) double red[N], green[N], blue[N], clear[N];  // colours and light behind the blocks
-    alignas(64) double rest[N];                // length of the shorter step, in steps
-    alignas(64) double begin[N];               // depth of sample 0
-    alignas(64) double entered[N], leaving[N];  // the path, in samples
-    alignas(64) double from[N];                // place of `previous`, in samples
-    alignas(64) double o[3][N], d[3][N], normal[3][N];
+    FHASH_LANES double red[N], green[N], blue[N], clear[N];  // colours and light behind the blocks
+    FHASH_LANES double rest[N];                // length of the shorter step, in steps
+    FHASH_LANES double begin[N];               // depth of sample 0
+    FHASH_LANES double entered[N], leaving[N];  // the path, in samples
+    FHASH_LANES double from[N];                // place of `previous`, in samples
+    FHASH_LANES double o[3][N], d[3][N], normal[3][N];
 
     float low[3], high[3];  // the part of the frame that is seen, in which all samples lie
     const bool whole;       // whether the frame has values in all of the drawn box
 
-    Packet(const FhashMarch& given, int drawn)
-        : m(given), flags(drawn), phong(given),
-          whole(std::equal(&m.box[0][0], &m.box[0][0] + 6, &m.seen[0][0])) {
+#if defined(FHASH_CUDA)
+    explicit Packet(const FhashInput& given)
+        : m(given), phong(given), whole(is_whole(given)) {
+#else
+    Packet(const FhashInput& given, int drawn)
+        : m(given), flags(drawn), phong(given), whole(is_whole(given)) {
+#endif
         for (int c = 0; c < 3; c++) {
             const double most = (double)m.shape[2 - c] - 1;
             low[c] = (float)clamp(m.seen[c][0], 0.0, most);
             high[c] = (float)clamp(m.seen[c][1], (double)low[c], most);
             // Behind a clipped face lies a cell that is not seen: no sample takes its gradient.
-            if (high[c] > low[c] && high[c] < (float)most) high[c] = std::nextafterf(high[c], -1.f);
+            if (high[c] > low[c] && high[c] < (float)most) high[c] = nextafterf(high[c], -1.f);
         }
     }
 
@@ -223,7 +245,7 @@ struct Packet {
         for (int c = 0; c < 3; c++) {
             place[c] = o[c][l] + sample * d[c][l];
             for (const double face : m.seen[c])
-                place[c] = std::fabs(place[c] - face) < 1e-7 ? face : place[c];
+                place[c] = fabs(place[c] - face) < 1e-7 ? face : place[c];
         }
         return fhash_cell_at(m, place[0], place[1], place[2], false);
     }
@@ -254,7 +276,7 @@ FHASH_INLINE float mixed(const float* v, int q, int sx, int sy, int sz, float fx
 
 // The share of light from the lamp (0) or from around (1) at a place, trilinear, clamped to the
 // grid.
-FHASH_INLINE float light_at(const FhashMarch& m, int which, float x, float y, float z) {
+FHASH_INLINE float light_at(const FhashInput& m, int which, float x, float y, float z) {
     const float scale = (float)m.light_scale;
     const int nx = (int)m.light_shape[2], ny = (int)m.light_shape[1], nz = (int)m.light_shape[0];
     x = clamp(x * scale + (float)m.light_offset[0], 0.f, (float)(nx - 1));

@@ -7,11 +7,11 @@ namespace {
 
 // Rays while they are aimed, before their samples are counted. Lengths are in the coordinates.
 struct Lines {
-    alignas(64) double eye[3][N];        // origins, in vertices of the frame
-    alignas(64) double direction[3][N];  // of unit length in the coordinates
-    alignas(64) double enter[N], leave[N];  // the drawn box
-    alignas(64) double first[N], stop[N];   // the part of it in which the frame has values
-    alignas(64) double share[N];            // of a step, from the entry to sample 0
+    FHASH_LANES double eye[3][N];        // origins, in vertices of the frame
+    FHASH_LANES double direction[3][N];  // of unit length in the coordinates
+    FHASH_LANES double enter[N], leave[N];  // the drawn box
+    FHASH_LANES double first[N], stop[N];   // the part of it in which the frame has values
+    FHASH_LANES double share[N];            // of a step, from the entry to sample 0
 };
 
 // Narrow the part of a ray to that between two faces. Where the ray does not move along their axis
@@ -43,7 +43,7 @@ FHASH_INLINE int Packet::aim(int64_t x, int64_t y, int64_t ray) {
     cut(lines);
     int met = count_samples(lines, (int)x, (int)y, ray);
     if (!whole && met) met = keep_seen(lines);
-    if (!met) return 0;
+    if (!of_any(met)) return 0;
     place(lines);
     reset();
     if ((flags & SHADED) || m.surfaces != 0) aim_light(lines);
@@ -52,7 +52,7 @@ FHASH_INLINE int Packet::aim(int64_t x, int64_t y, int64_t ray) {
 
 // Origins and directions of rays through pixels.
 FHASH_INLINE void Packet::point(Lines& lines, int left_most, int top_most, int64_t ray) {
-    alignas(64) double u[N], w[N], length[N];
+    FHASH_LANES double u[N], w[N], length[N];
     const int width = (int)m.width, height = (int)m.height;
     const double right_of = (ray % m.rays + 0.5) / m.rays, below = (ray / m.rays + 0.5) / m.rays;
     double columns[SIDE], rows[SIDE];
@@ -78,7 +78,7 @@ FHASH_INLINE void Packet::point(Lines& lines, int left_most, int top_most, int64
         }
     }
     #pragma omp simd
-    for (int l = 0; l < N; l++) length[l] = std::sqrt(length[l]);
+    for (int l = 0; l < N; l++) length[l] = sqrt(length[l]);
     for (int c = 0; c < 3; c++) {
         #pragma omp simd
         for (int l = 0; l < N; l++) lines.direction[c][l] /= length[l];
@@ -129,7 +129,7 @@ FHASH_INLINE int Packet::count_samples(Lines& lines, int left_most, int top_most
         // Without a direction a ray never leaves.
         const bool hit = leave > enter && leave < ENDLESS && lines.stop[l] > lines.first[l];
         const double steps = hit ? (leave - enter) / m.step : 0;
-        const double most = min(std::ceil(steps), 2147483000.0);
+        const double most = min(ceil(steps), 2147483000.0);
         const uint32_t pixel = (uint32_t)min(row, height - 1) * width + min(column, width - 1);
         const double share = m.jitter ? random_share(pixel * rays_of_pixel + (uint32_t)ray) : 0.5;
         last[l] = (int)most - 1;
@@ -157,8 +157,8 @@ int Packet::keep_seen(const Lines& lines) {
         const double begins = (max(first, enter) - enter) / m.step - lines.share[l];
         const double ends = (min(stop, leave) - enter) / m.step - lines.share[l];
         const double most = count[l];
-        const int behind = (int)min(max(std::floor(ends) + 1, 0.0), most);
-        k[l] = first > enter ? (int)min(max(std::ceil(begins), 0.0), most) : 0;
+        const int behind = (int)min(max(floor(ends) + 1, 0.0), most);
+        k[l] = first > enter ? (int)min(max(ceil(begins), 0.0), most) : 0;
         count[l] = stop < leave ? behind : count[l];
         entered[l] = from[l] = count[l] ? begins : 0;
         leaving[l] = count[l] ? ends : 0;
@@ -213,7 +213,7 @@ FHASH_INLINE void Packet::reset() {
 
 // The directions towards the light, and halfway between the light and the eye.
 void Packet::aim_light(const Lines& lines) {
-    alignas(64) double half[3][N], size[N];
+    FHASH_LANES double half[3][N], size[N];
     const bool at_eye = m.lamp[0] == 0 && m.lamp[1] == 0 && m.lamp[2] == 0;
     float* const towards[3][2] = {{tox, hx}, {toy, hy}, {toz, hz}};
     #pragma omp simd
@@ -229,7 +229,7 @@ void Packet::aim_light(const Lines& lines) {
     }
     // Light from straight behind has no highlight.
     #pragma omp simd
-    for (int l = 0; l < N; l++) size[l] = size[l] > 1e-12 ? 1 / std::sqrt(size[l]) : 0;
+    for (int l = 0; l < N; l++) size[l] = size[l] > 1e-12 ? 1 / sqrt(size[l]) : 0;
     for (int c = 0; c < 3; c++) {
         #pragma omp simd
         for (int l = 0; l < N; l++) towards[c][1][l] = (float)(half[c][l] * size[l]);

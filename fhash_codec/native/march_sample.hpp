@@ -88,7 +88,7 @@ void Packet::shorten() {
         const double* extinction = m.extinction + t;
         const double here = extinction[0] + (at[l] - t) * (extinction[1] - extinction[0]);
         alpha[l] = (float)(alpha[l] < 0.01 ? opacity_of_share(alpha[l], rest[l])
-                                           : -std::expm1(-rest[l] * here));
+                                           : -expm1(-rest[l] * here));
     }
 }
 
@@ -118,9 +118,9 @@ void Packet::mend() {
     }
 }
 
-// The trilinear value at a place within the frame; values: (z, y, x) of the frame's shape.
-FHASH_INLINE float value_at(const FhashMarch& m, const float* values, float x, float y, float z) {
-    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
+// The trilinear value at a place within the vertices; values: (z, y, x) of a shape.
+FHASH_INLINE float value_at(const int64_t* shape, const float* values, float x, float y, float z) {
+    const int lx = (int)shape[2], ly = (int)shape[1], lz = (int)shape[0];
     const int i = min((int)x, max(lx - 2, 0)), j = min((int)y, max(ly - 2, 0));
     const int h = min((int)z, max(lz - 2, 0)), q = (h * ly + j) * lx + i;
     return mixed(values, q, lx > 1, ly > 1 ? lx : 0, lz > 1 ? lx * ly : 0, x - i, y - j, z - h);
@@ -140,12 +140,12 @@ void Packet::slopes(const float* values) {
     #pragma omp simd reduction(| : lost)
     for (int l = 0; l < N; l++) {
         const float x = px[l], y = py[l], z = pz[l];
-        const float east = value_at(m, values, min(x + 1, mx), y, z);
-        const float ex = (east - value_at(m, values, max(x - 1, 0.f), y, z)) * wx;
-        const float north = value_at(m, values, x, min(y + 1, my), z);
-        const float ey = (north - value_at(m, values, x, max(y - 1, 0.f), z)) * wy;
-        const float above = value_at(m, values, x, y, min(z + 1, mz));
-        const float ez = (above - value_at(m, values, x, y, max(z - 1, 0.f))) * wz;
+        const float east = value_at(m.shape, values, min(x + 1, mx), y, z);
+        const float ex = (east - value_at(m.shape, values, max(x - 1, 0.f), y, z)) * wx;
+        const float north = value_at(m.shape, values, x, min(y + 1, my), z);
+        const float ey = (north - value_at(m.shape, values, x, max(y - 1, 0.f), z)) * wy;
+        const float above = value_at(m.shape, values, x, y, min(z + 1, mz));
+        const float ez = (above - value_at(m.shape, values, x, y, max(z - 1, 0.f))) * wz;
         gx[l] = ex == ex ? ex : gx[l];
         gy[l] = ey == ey ? ey : gy[l];
         gz[l] = ez == ez ? ez : gz[l];

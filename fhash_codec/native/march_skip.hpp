@@ -126,12 +126,14 @@ bool Packet::fetch() {
     #pragma omp simd reduction(| : missing)
     for (int l = 0; l < N; l++)
         missing |= on[l] & !ready[spot_of(*this, l, lx, ly, lz, bx, by).brick];
+#if !defined(FHASH_CUDA)
     std::atomic_thread_fence(std::memory_order_acquire);  // another thread may have fetched it
+#endif
     if (!missing) return false;
     for (int l = 0; l < N; l++) {
         const int brick = spot_of(*this, l, lx, ly, lz, bx, by).brick;
         if (!on[l] || ready[brick] || !m.fetch(brick)) continue;
-        std::copy_n(count, N, k);
+        for (int ray = 0; ray < N; ray++) k[ray] = count[ray];
         break;
     }
     return true;

@@ -14,7 +14,7 @@ void Packet::see(int l, double sample, const FhashCell* given, Counters& counted
     const FhashCell here = given ? *given : cell(l, sample);
     counted.gradients += !given;
     const double x = here.gx / m.spacing[0], y = here.gy / m.spacing[1], z = here.gz / m.spacing[2];
-    double size = std::sqrt(x * x + y * y + z * z);
+    double size = sqrt(x * x + y * y + z * z);
     if (!(size > 0) || !(size < ENDLESS)) return;
     const double away = x * d[0][l] * m.spacing[0] + y * d[1][l] * m.spacing[1] +
                         z * d[2][l] * m.spacing[2];
@@ -91,10 +91,11 @@ void Packet::cross(int l, double to, double now, Counters& counted) {
         if ((before < level) == (now < level)) continue;
         const double place = root(l, level, to, now, counted);
         const double there = cell(l, place, false).value;
-        if (there == there) roots[crossed++] = {place, s};
+        if (!(there == there)) continue;
+        int after = crossed++;
+        for (; after > 0 && roots[after - 1].at > place; after--) roots[after] = roots[after - 1];
+        roots[after] = {place, s};
     }
-    std::sort(roots, roots + crossed,
-              [](const Root& one, const Root& other) { return one.at < other.at; });
     for (int n = 0; n < crossed; n++)
         add_surface(l, roots[n].at, m.surface[roots[n].which], counted);
 }

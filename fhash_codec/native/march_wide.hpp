@@ -68,7 +68,7 @@ struct Spots {
     __m512i brick;       // numbers of the bricks
 };
 FHASH_WIDE Spots spots_of(const Packet& p, __m512i k) {
-    const FhashMarch& m = p.m;
+    const FhashInput& m = p.m;
     const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const __m512i cx = _mm512_set1_epi32(lx - 2), cy = _mm512_set1_epi32(max(ly - 2, 0));
@@ -93,7 +93,7 @@ FHASH_WIDE Spots spots_of(const Packet& p, __m512i k) {
 // The rays whose sample lies in an invisible cell or brick.
 template <Leaps BY>
 FHASH_WIDE __mmask16 invisible(const Packet& p, const Spots& at) {
-    const FhashMarch& m = p.m;
+    const FhashInput& m = p.m;
     const __m512i one = _mm512_set1_epi32(1), three = _mm512_set1_epi32(3);
     if (BY == BY_LARGEST) {
         const __m512 highest = _mm512_i32gather_ps(at.brick, m.highest, 4);
@@ -150,7 +150,7 @@ FHASH_WIDE __m512i behind_invisible(const Packet& p, const Spots& at, __mmask16 
 // that more rays are in a pass.
 template <Leaps BY>
 FHASH_WIDE int leap_wide(Packet& p, Counters& counted) {
-    const FhashMarch& m = p.m;
+    const FhashInput& m = p.m;
     const __m512i one = _mm512_set1_epi32(1), count = _mm512_load_si512(p.count);
     const __m512 previous = _mm512_load_ps(p.previous);
     const __mmask16 kept =
@@ -191,7 +191,7 @@ FHASH_WIDE int leap_wide(Packet& p, Counters& counted) {
 struct Corners {
     __m512 fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3;
 };
-FHASH_WIDE Corners corners_at(const FhashMarch& m, const float* values, __m512 x, __m512 y,
+FHASH_WIDE Corners corners_at(const FhashInput& m, const float* values, __m512 x, __m512 y,
                               __m512 z) {
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const int sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
@@ -213,7 +213,7 @@ FHASH_WIDE Corners corners_at(const FhashMarch& m, const float* values, __m512 x
 
 // `sample` by AVX-512, and the colours.
 template <Taken KIND> FHASH_WIDE void sample_wide(Packet& p, Counters& counted, Seen& seen) {
-    const FhashMarch& m = p.m;
+    const FhashInput& m = p.m;
     const __m512 zero = _mm512_setzero_ps();
     const __m512i k = _mm512_load_si512(p.k);
     const __m512i taking = _mm512_load_si512(p.on);
@@ -275,7 +275,7 @@ template <Taken KIND> FHASH_WIDE void sample_wide(Packet& p, Counters& counted, 
 }
 
 // The trilinear values at places within the frame.
-FHASH_WIDE __m512 values_at(const FhashMarch& m, const float* values, __m512 x, __m512 y,
+FHASH_WIDE __m512 values_at(const FhashInput& m, const float* values, __m512 x, __m512 y,
                             __m512 z) {
     const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, values, x, y, z);
     const __m512 near = between(between(a0, a1, fx), between(a2, a3, fx), fy);
@@ -293,7 +293,7 @@ FHASH_WIDE __mmask16 slope(__m512 behind, __m512 before, double factor, float* t
 
 // `slopes` by AVX-512. Returns whether a difference that is needed is missing.
 FHASH_WIDE int slopes_wide(Packet& p, const float* values) {
-    const FhashMarch& m = p.m;
+    const FhashInput& m = p.m;
     const __m512 zero = _mm512_setzero_ps(), one = _mm512_set1_ps(1.f);
     const __m512 mx = _mm512_set1_ps((float)(m.shape[2] - 1));
     const __m512 my = _mm512_set1_ps((float)(m.shape[1] - 1));

@@ -22,6 +22,7 @@ from fhash_codec.devices import (
 )
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines import Engine, describe_engine, make_engine
+from fhash_codec.paper.engines.fused import refusal
 from fhash_codec.paper.engines.native import cpu_seconds
 from fhash_codec.paper.engines.parameters import needed_bytes
 from fhash_codec.paper.network import Architecture, rounding_bound
@@ -273,6 +274,9 @@ class _Fitting:
         self._progress, self._goal = progress, goal
         self._limited, self._threads = False, 1
         self._psnr: float | None = None
+        # An engine that is named says where to train, too.
+        of_engine = {"fused": "cuda", "native": "cpu"}.get(config.engine, "auto")
+        self._wanted = of_engine if config.device == "auto" else config.device
         self._device = self._choose_device()
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
@@ -385,9 +389,10 @@ class _Fitting:
         batches = usual_batches(samples, bricks, self._config.batch)
         epochs = self._config.epochs or usual_epochs(batches)
         device, why = training_device(
-            self._config.device,
+            self._wanted,
             cpu_seconds(self._architecture, samples * epochs),
             needed_bytes(self._architecture, self._coreset),
+            refusal(self._architecture),
         )
         tell("engine", f"tables and network at their random start, {why}")
         return device
@@ -400,7 +405,8 @@ class _Fitting:
             self._coreset,
             plan.rates,
             seed=self._config.seed,
-            device=self._device,
+            # CUDA that nobody named gives way to the CPU where its kernels cannot be had.
+            device="cpu" if self._device == "cpu" else self._wanted,
         )
         if self._saved_state is not None:
             try:

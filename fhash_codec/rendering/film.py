@@ -276,7 +276,7 @@ def _images(job: _Job) -> Generator[Image, None, None]:
             raise InputError(
                 f"{volume.path}: the file changed while it was rendered; render it again"
             )
-        renderer = Renderer(volume)
+        renderer = Renderer(volume, pictures=len(job.scenes))
         for scene, upcoming in zip(job.scenes, (*job.scenes[1:], None), strict=True):
             image = renderer.render(scene, upcoming=upcoming)
             yield dataclasses.replace(image, counters=dict(image.counters), scene=dict(image.scene))
@@ -454,7 +454,7 @@ def _rendered(
     if processes > 1:
         yield from rendered_by_workers(volume, scenes, processes)
         return
-    renderer = Renderer(volume)
+    renderer = Renderer(volume, pictures=len(scenes))
     # A frame is decoded ahead only for the very next picture.
     following = {number: after.scene for number, after in enumerate(frames[1:]) if not after.kept}
     for number, frame in enumerate(frames):

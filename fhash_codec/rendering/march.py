@@ -16,6 +16,7 @@ from fhash_codec.native import ffi, pointer
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, reach_of, smoothed
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
+from fhash_codec.rendering.march_device import DeviceMarcher
 from fhash_codec.rendering.march_task import (
     GRADES,
     MAX_VALUES,
@@ -114,7 +115,8 @@ class MarchInput:
             [np.maximum(within[:, 0], box[:, 0]), np.minimum(within[:, 1], box[:, 1])], axis=-1
         )
         seen[:, 1] = np.maximum(seen[:, 1], seen[:, 0])  # nothing, and no box that is turned over
-        values = scaling.array(bricks.values)
+        # Of a network the shape alone counts.
+        values = frame.values if frame.network else scaling.array(bricks.values)
         fields = {
             "values": values,
             "shape": values.shape,
@@ -147,7 +149,9 @@ class MarchInput:
             start, stop = map(scaling.number, (frame.network.low, frame.network.high))
             fields |= {
                 **frame.network.fields,
-                "network_whole": not np.isnan(values).any(),
+                "values": frame.network.mask,
+                "network_shape": frame.network.mask.shape,
+                "network_whole": not np.isnan(frame.network.mask).any(),
                 "network_low": start,
                 "network_span": stop - start,
                 "network_status": np.zeros(1, np.int64),
@@ -232,7 +236,6 @@ COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks", "evaluati
 
 
 def march_native(
-    library: native.Library,
     frame: Frame | TiledFrame,
     task: Task,
     bricks: Bricks,
@@ -240,12 +243,15 @@ def march_native(
     *,
     path: int = 0,
     progress: Progress = silent,
+    device: DeviceMarcher | None = None,
 ) -> Marched:
     """The picture of a task, as `march` describes it.
 
     path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
-    every processor has. The pictures agree within rounding.
+        every processor has. The pictures agree within rounding.
+    device: draws in place of the processor.
     """
+    library = native.library()
     tiles = frame if isinstance(frame, TiledFrame) else None
     frame = frame.frame if isinstance(frame, TiledFrame) else frame
     assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
@@ -283,7 +289,13 @@ def march_native(
         normal=normal,
         path=path,
     )
-    counters = _march(library, structure_of(everything), task, threads, progress)
+    if device is None:
+        counters = _march(library, structure_of(everything), task, threads, progress)
+    else:
+        network = None if frame.network is None else frame.network.device
+        counters = _counted(
+            device.march(everything, _flags(task), fetching=fetching, network=network)
+        )
     if fetching is not None and fetching.error is not None:
         raise fetching.error
     if frame.network is not None and given.fields["network_status"].any():
@@ -300,7 +312,7 @@ def _skipping_fields(
     each brick for the maximum along a ray, the smallest times -1 for the minimum.
     """
     by = _leaps_by(given, task)
-    if by == "highest" and given.fields["values"] is bricks.values:
+    if by == "highest" and ("network" in given.fields or given.fields["values"] is bricks.values):
         return {"highest": bricks.high if task.projection == "maximum" else -bricks.low}
     if by != "distance":  # scaled values have other extremes than the bricks
         return {}
@@ -417,22 +429,21 @@ def _march(
     progress: Progress,
 ) -> dict[str, int]:
     """March all rays in several threads, into the buffers of a structure; the counters."""
-    flags = SHADED * task.shaded | LIT * (task.light is not None)
-    if task.grading is not None:
-        flags |= SHADED | GRADED
-    if task.projection:
-        flags = PROJECTIONS[task.projection]
-    spans = _spans(task)
+    flags, spans = _flags(task), _spans(task)
     groups = count()
 
     def work(thread: int) -> npt.NDArray[np.int64]:
         counters = np.zeros(len(COUNTED), dtype=np.int64)
         while (group := next(groups)) < len(spans):
             if thread == 0:
-                progress("marching", group, len(spans), "")
-            first, stop = spans[group]
-            failed = library.fhash_march(structure, flags, first, stop, pointer(counters))
-            assert not failed
+                try:
+                    progress("marching", group, len(spans), "")
+                except BaseException:
+                    spans.clear()  # the other threads end, too
+                    raise
+            for first, stop in spans[group : group + 1]:
+                failed = library.fhash_march(structure, flags, first, stop, pointer(counters))
+                assert not failed
         return counters
 
     workers = max(1, min(threads or usable_threads(), len(spans)))
@@ -440,7 +451,20 @@ def _march(
         total = work(0)
     else:
         total = sum(in_threads(work, range(workers)), np.zeros(len(COUNTED), dtype=np.int64))
-    return complete(dict(zip(COUNTED, total.tolist(), strict=True)))
+    return _counted(total)
+
+
+def _flags(task: Task) -> int:
+    """What is drawn, as flags of `fhash_march`."""
+    if task.projection:
+        return PROJECTIONS[task.projection]
+    graded = (SHADED | GRADED) * (task.grading is not None)
+    return SHADED * task.shaded | LIT * (task.light is not None) | graded
+
+
+def _counted(counters: npt.NDArray[np.int64]) -> dict[str, int]:
+    """Counters by name."""
+    return complete(dict(zip(COUNTED, counters.tolist(), strict=True)))
 
 
 def _spans(task: Task) -> list[tuple[int, int]]:
@@ -474,6 +498,7 @@ def march(
     bricks: Bricks | None = None,
     threads: int | None = None,
     progress: Progress = silent,
+    device: DeviceMarcher | None = None,
 ) -> Marched:
     """March the rays of a task.
 
@@ -492,6 +517,7 @@ def march(
         bricks: of the frame; made if None.
         threads: most threads; None for all processors.
         progress: is told of the rows that are done.
+        device: draws in place of the processor.
 
     Raises InputError for more than MAX_SURFACES surfaces.
     """
@@ -503,11 +529,11 @@ def march(
         surfaces = dataclasses.replace(task, projection="", table=None, shaded=False)
         projection = dataclasses.replace(task, surfaces=())
         front, back = (
-            march_native(native.library(), frame, part, bricks, threads, progress=progress)
+            march_native(frame, part, bricks, threads, progress=progress, device=device)
             for part in (surfaces, projection)
         )
         return _over(front, back)
-    return march_native(native.library(), frame, task, bricks, threads, progress=progress)
+    return march_native(frame, task, bricks, threads, progress=progress, device=device)
 
 
 def _over(front: Marched, back: Marched) -> Marched:

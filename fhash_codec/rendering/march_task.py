@@ -202,16 +202,25 @@ def extinctions_in(extinctions: Double, length: float) -> Double:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NetworkValues:
-    """A network that the native marcher evaluates at its samples.
+    """A network that is evaluated at the marcher's samples.
 
     Attributes:
         fields: of the marcher, that name the network's function and what it takes.
         low, high: values of the network's 0 and 1.
+        mask: float32 (z, y, x), NaN at vertices of the network's box that have no value.
+        held: what the fields point to.
+        bounds: the box (3, 2), x, y, z, in drawn vertices, in which it has values, where its axes
+            are uneven.
+        device: the network on a device; None for the processor.
     """
 
     fields: Mapping[str, Any]
     low: float
     high: float
+    mask: Single
+    held: Any = None
+    bounds: Double | None = None
+    device: Any = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -241,6 +250,8 @@ class Frame:
             np.array(self.values.shape[::-1]),
         )
         ends = first + counts * self.stride
+        if self.network is not None and self.network.bounds is not None:
+            return self.network.bounds
         low = np.where(first == 0, grid.bounds[:, 0], first)
         high = np.where(ends > np.array(grid.counts) - 1, grid.bounds[:, 1], ends - self.stride)
         return np.stack([low, high], axis=-1)

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import MAX_LOD, Box
-from fhash_codec.devices import choose_device, may_have_cuda
+from fhash_codec.cuda.device import has_device
+from fhash_codec.devices import check_cuda, choose_device, may_have_cuda
 from fhash_codec.rendering.bricks import SIDE
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
@@ -41,6 +42,7 @@ from fhash_codec.rendering.transfer_function import Histogram, TransferFunction,
 from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.support.threads import usable_threads
 from fhash_formats.support.values import Double
 
 
@@ -77,7 +79,8 @@ class Plan:
         time: physical time.
         mode: 'cache', 'arm' or 'stream'.
         network: whether rays march through the published network.
-        streams: whether samples are streamed, not marched in packets of rays on a processor.
+        device: 'cpu' or 'cuda', which draws.
+        why_device: reason for the device, for people.
         why_mode: reason why 'auto' took the mode, for people; empty where the scene names it.
         lod: level of detail, 0 for the finest.
         why_lod: reason for the level, for people.
@@ -97,7 +100,8 @@ class Plan:
     time: float
     mode: str
     network: bool
-    streams: bool
+    device: str
+    why_device: str
     why_mode: str
     lod: int
     why_lod: str
@@ -108,6 +112,11 @@ class Plan:
     occlusion: AmbientOcclusion | None
     lamp: npt.NDArray[np.float64] | None
     reasons: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def streams(self) -> bool:
+        """Whether samples are streamed, not marched in packets of rays."""
+        return self.mode == "stream"
 
     @property
     def lights(self) -> bool:
@@ -154,6 +163,7 @@ def reasons(plan: Plan, volume: Volume) -> list[tuple[str, str]]:
         ("proportions", _scale_text(plan)),
         ("time", _time_text(plan)),
         ("march", _mode_text(plan, volume)),
+        ("device", f"{plan.device}: {plan.why_device}"),
         ("value", _value_text(plan)),
         ("gradient", _gradient_text(plan)),
         ("secondary rays", _secondary_text(plan)),
@@ -253,6 +263,8 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
     budget = plan.scene.march.samples_per_pass
     if plan.mode == "stream":
         samples = "one sample of each ray in a pass"
+    elif plan.device == "cuda":
+        samples = "up to 16 samples of each ray, the more the fewer rays of a warp are left"
     elif not plan.streams:
         samples = "up to 16 samples of each ray at a time"
     else:
@@ -354,12 +366,25 @@ through the network.
 A sample takes 0.4 to 0.6 times as long as a vertex is decoded; but a second picture of the same
 step is faster from the kept frame.
 """
+CUDA_START = 0.5
+"""Seconds that a CUDA device takes to start, about: its context and kernels from the cache.
+
+An estimate, until `make device` has measured the start without torch.
+"""
+SAMPLES = 4e7
+"""Samples that a thread of a CPU marches in a second through decoded values, about."""
+NETWORK_SAMPLES = 8e6
+"""The same through a network."""
 MAX_RAYS = 2**26
 """Most rays of a picture: more would not fit in the memory of most machines."""
 
 
 def plan_picture(
-    volume: Volume, scene: Scene, *, histogram: Callable[[], Histogram] | None = None
+    volume: Volume,
+    scene: Scene,
+    *,
+    histogram: Callable[[], Histogram] | None = None,
+    pictures: int = 1,
 ) -> Plan:
     """Plan the picture of a scene.
 
@@ -367,6 +392,7 @@ def plan_picture(
         volume: an open container.
         scene: what to show; not an evolution.
         histogram: counts the values of the series; called only if the opacity depends on them.
+        pictures: that will be drawn alike, about: the start of a device is for all of them.
 
     Raises InputError for what cannot be drawn, RegionError for a time outside the series.
     """
@@ -395,13 +421,9 @@ def plan_picture(
     lit = shadows is not None or occlusion is not None
     region = domain if lit else region_in_view(rays, volume, task.body, margin)
     ends = not lit and _ends_rays(task) and _many_blocks(volume, region, lod)
-    mode, why_mode = _mode(volume, scene, ends)
+    device, why_device = _device(volume, scene, task, pictures)
+    mode, why_mode = _mode(volume, scene, ends, device)
     network = volume.profile == "paper" and mode != "cache"
-    # In packets of rays march a processor's, but through networks on even axes alone.
-    streams = mode == "stream" or (
-        mode == "arm"
-        and ((network and grid.warp is not None) or arrays_of(volume, scene) is not NUMPY)
-    )
     if lit or not network:
         _check_frame(region, lod)
     plan = Plan(
@@ -412,7 +434,8 @@ def plan_picture(
         time=_time_of(volume, step),
         mode=mode,
         network=network,
-        streams=streams,
+        device=device,
+        why_device=why_device,
         why_mode=why_mode,
         lod=lod,
         why_lod=why_lod,
@@ -689,32 +712,50 @@ def _many_blocks(volume: Volume, region: Box, lod: int) -> bool:
     return math.prod(-(-n // size) for n, size in zip(region.shape, sizes, strict=True)) >= 8
 
 
-def _mode(volume: Volume, scene: Scene, ends: bool) -> tuple[str, str]:
-    """The way to march, and why 'auto' took it; InputError for one that cannot be had.
+def _mode(volume: Volume, scene: Scene, ends: bool, device: str) -> tuple[str, str]:
+    """The way to march, and why 'auto' took it.
 
-    ends: whether rays end before they have seen most of a decoded frame.
+    ends: whether rays end before they have seen most of a decoded frame. device: that draws.
     """
     march, network = scene.march, volume.profile == "paper"
-    if march.mode == "cache" and march.device == "cuda":
-        raise InputError(
-            "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"
-        )
     if march.mode != "auto":
         return march.mode, ""
-    if march.device == "cuda" or (network and arrays_of(volume, scene) is not NUMPY):
-        return "arm", "chosen for the GPU"
+    if network and device == "cuda":
+        return "arm", "chosen for the GPU, which evaluates the network where the rays are"
     if _few_samples(volume, scene):
         return "arm", "chosen since so few samples cost less than decoding the frame"
     if ends and not network:
         return "arm", "chosen since rays end at what is opaque and need no tile behind it"
-    return "cache", "as is fastest on a CPU" + ("" if network else " where rays need most tiles")
+    fastest = "as is fastest" + ("" if device == "cuda" else " on a CPU")
+    return "cache", fastest + ("" if network else " where rays need most tiles")
 
 
-def arrays_of(volume: Volume, scene: Scene) -> Arrays:
-    """The arrays that samples are streamed in: on a GPU a network's, and others if it is named."""
-    device = scene.march.device
-    decoded = volume.profile != "paper" and device == "auto"
-    return arrays_on("cpu" if decoded else device)
+def _device(volume: Volume, scene: Scene, task: Task, pictures: int) -> tuple[str, str]:
+    """The device that draws, and why; InputError for one that is not here."""
+    asked = scene.march.device
+    if asked not in DEVICES:
+        raise InputError(f"device is '{asked}'; allowed: {', '.join(DEVICES)}")
+    if asked == "cpu":
+        return "cpu", "as the scene says"
+    check_cuda(asked, torch=False)
+    if not has_device():
+        return "cpu", "there is no CUDA device"
+    if asked == "cuda":
+        return "cuda", "as the scene says"
+    grid = task.rays.grid
+    width, height = task.rays.size
+    longest = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
+    samples = width * height * task.antialiasing**2 * longest / 2 * pictures
+    rate = (NETWORK_SAMPLES if volume.profile == "paper" else SAMPLES) * usable_threads()
+    seconds = samples / rate
+    many = "" if pictures == 1 else f" for {pictures} pictures"
+    cost = f"the CPU needs about {seconds:.2g} s{many}, and CUDA takes {CUDA_START:g} s to start"
+    return ("cuda" if seconds > CUDA_START else "cpu"), cost
+
+
+def arrays_of(scene: Scene) -> Arrays:
+    """The arrays that samples are streamed in: on a GPU where that is named."""
+    return arrays_on("cuda" if scene.march.device == "cuda" else "cpu")
 
 
 def _few_samples(volume: Volume, scene: Scene) -> bool:

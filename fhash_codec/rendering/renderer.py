@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 import time
+import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,12 +16,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.cuda.device import first_device
+from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.progress import Progress, silent
+from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.image import Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.march_task import Marched, Task, complete
+from fhash_codec.rendering.march_device import DeviceMarcher
+from fhash_codec.rendering.march_task import Frame, Marched, Task, complete
+from fhash_codec.rendering.network_frame import network_frame
 from fhash_codec.rendering.plan import Plan, arrays_of, plan_at, plan_picture
 from fhash_codec.rendering.scenes import MAX_SIDE, USUAL_EFFECTS, Scene
 from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField
@@ -28,7 +34,7 @@ from fhash_codec.rendering.stream_march import stream
 from fhash_codec.rendering.tiled_frame import FrameField, TiledFrame
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_codec.volume import Volume, only_features
-from fhash_formats.errors import FhashError, InputError
+from fhash_formats.errors import FhashError, FhashWarning, InputError
 from fhash_formats.support.files import file_name, without_secrets
 
 GAP = 1 / 64
@@ -162,6 +168,11 @@ GLANCE = 2**15
 """Most vertices of a frame that is read to look at it: 32 along each axis show its shape."""
 
 
+TRIAL_SIZE = (48, 40)
+"""Pixels of the picture by which new kernels are tried."""
+Source = Callable[[DeviceMarcher | None], tuple[Frame | TiledFrame, Bricks]]
+
+
 class Renderer:
     """Renders pictures of one volume and keeps decoded frames for the next pictures.
 
@@ -169,20 +180,31 @@ class Renderer:
     the volume until the next picture begins.
     """
 
-    def __init__(self, volume: Volume, *, memory: int = MEMORY, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        volume: Volume,
+        *,
+        memory: int = MEMORY,
+        threads: int | None = None,
+        pictures: int = 1,
+    ) -> None:
         """Prepare to render a volume.
 
         Args:
             volume: an open container.
             memory: bytes of decoded frames to keep.
             threads: most threads for marching; None for all processors.
+            pictures: that will be drawn, about: the more, the sooner a device pays for its start.
         """
         self.volume, self.memory, self.threads = volume, memory, threads
+        self._pictures = pictures
         self._whole = volume
         self._features: tuple[str, ...] = ()
         self._frames: OrderedDict[Key, TiledFrame] = OrderedDict()
         self._histogram: Histogram | None = None
         self._last_plan: tuple[Scene, Plan] | None = None
+        self._marcher: DeviceMarcher | None = None
+        self._refused = False
         self._fullest: tuple[Any, int] | None = None
         self._background: ThreadPoolExecutor | None = None
         self._prefetch: tuple[Key, Future[TiledFrame]] | None = None
@@ -199,7 +221,7 @@ class Renderer:
         timeless = replace(scene, step=None, time=None)
         if self._last_plan is not None and self._last_plan[0] == timeless:
             return plan_at(self._last_plan[1], self.volume, scene)
-        plan = plan_picture(self.volume, scene, histogram=self.histogram)
+        plan = plan_picture(self.volume, scene, histogram=self.histogram, pictures=self._pictures)
         self._last_plan = timeless, plan
         return plan
 
@@ -288,8 +310,8 @@ class Renderer:
         frame, bricks = tiles.frame, tiles.bricks
         if not plan.streams:
             source = frame if tiles.decoded.all() else tiles
-            return march(source, task, bricks=bricks, threads=self.threads, progress=progress)
-        arrays = arrays_of(self.volume, plan.scene)
+            return self._drawn(plan, task, lambda marcher: (source, bricks), progress)
+        arrays = arrays_of(plan.scene)
         marched = stream(
             FrameField(frame, bricks, task.rays.grid, arrays),
             task,
@@ -302,14 +324,17 @@ class Renderer:
 
     def _march_network(self, plan: Plan, task: Task, progress: Progress) -> Marched:
         """March the rays of a task through the published network."""
-        arrays = arrays_of(self.volume, plan.scene)
-        network = NetworkField(self.volume, plan.step, plan.units, arrays)
-        field: Field = network
-        if task.rays.grid.warp is not None:
-            field = WarpedField(field, task.rays.grid.warp)
-        elif not plan.streams and (frame := network.frame) is not None:
-            bricks, threads = network.bricks, self.threads
-            return march(frame, task, bricks=bricks, threads=threads, progress=progress)
+        warp = task.rays.grid.warp
+        if not plan.streams:
+            return self._drawn(
+                plan,
+                task,
+                lambda marcher: network_frame(self.volume, plan.step, plan.units, warp, marcher),
+                progress,
+            )
+        field: Field = NetworkField(self.volume, plan.step, plan.units, arrays_of(plan.scene))
+        if warp is not None:
+            field = WarpedField(field, warp)
         return stream(
             field,
             task,
@@ -317,6 +342,38 @@ class Renderer:
             budget=plan.scene.march.samples_per_pass,
             progress=progress,
         )
+
+    def _drawn(self, plan: Plan, task: Task, source: Source, progress: Progress) -> Marched:
+        """March on the plan's device, kernels that never ran here before after a trial.
+
+        source: function of the device, None for the processor, that gives the frame and its bricks.
+        """
+
+        def by(marcher: DeviceMarcher | None, task: Task = task) -> Marched:
+            frame, bricks = source(marcher)
+            threads = self.threads
+            return march(
+                frame, task, bricks=bricks, threads=threads, progress=progress, device=marcher
+            )
+
+        if plan.device == "cpu" or self._refused:
+            return by(None)
+        try:
+            if self._marcher is None:
+                self._marcher = DeviceMarcher(first_device())
+            marched = by(self._marcher)
+            if self._marcher.new:
+                rays = replace(task.rays, size=TRIAL_SIZE)
+                small = replace(task, rays=rays, antialiasing=1)
+                self._marcher.judge(by(self._marcher, small), by(None, small))
+            return marched
+        except (Unavailable, MemoryError) as error:
+            reason = f"the CUDA device cannot draw this: {error}"
+            if plan.scene.march.device == "cuda":
+                raise InputError(f"{reason}; use --device cpu") from error
+            warnings.warn(f"{reason}; the CPU draws", FhashWarning, stacklevel=2)
+            self._refused = True
+            return by(None)
 
     def _finish(self, plan: Plan, marched: Marched, more: dict[str, int], begin: float) -> Image:
         """Make a picture of what was marched, with its overlay.

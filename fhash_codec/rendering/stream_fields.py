@@ -18,12 +18,11 @@ from fhash_codec.rendering.march_task import (
     NUMPY,
     Array,
     Arrays,
-    Frame,
     Grading,
-    NetworkValues,
     Task,
     Units,
 )
+from fhash_codec.rendering.network_frame import possible_bricks
 from fhash_codec.volume import Volume
 from fhash_formats.support.threads import usable_threads
 
@@ -208,7 +207,8 @@ class CoresetField:
         self._jumps = (1, int(counts[0]), int(counts[0] * counts[1]))
         with arrays.guarded():
             self._in_coreset = arrays.array(in_coreset)
-        self.bricks = _possible(in_coreset, *ends)
+        mask = np.where(in_coreset, np.float32(1), np.float32(np.nan))
+        self.bricks = possible_bricks(mask, *ends)
 
     def visible(self, palette: Palette) -> Array:
         """Cells with a vertex of the coreset: their values are not known before evaluation."""
@@ -258,16 +258,6 @@ class NetworkField(CoresetField):
         with arrays.guarded():
             self._inference = inference_in(arrays, model.network, volume.key_times.key_index(step))
 
-    @property
-    def frame(self) -> Frame | None:
-        """The frame for the native marcher, as long as this is; None on a device."""
-        if not isinstance(self._inference, HostInference) or self.arrays.device is not None:
-            return None
-        x, y, z = self.first
-        fields = self._inference.sampler.fields()
-        network = NetworkValues(fields=fields, low=self._low, high=self._high)
-        return Frame(values=self.bricks.values, first=(int(z), int(y), int(x)), network=network)
-
     def values(self, places: Array, wanted: Array | None = None) -> Array:
         arrays, (at, inside) = self.arrays, self.inside(places)
         result = arrays.full(len(places), np.nan)
@@ -290,21 +280,6 @@ class NetworkField(CoresetField):
             slopes = arrays.xp.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
             result[some] = arrays.kept(inside[some], slopes, 0.0)
         return result
-
-
-def _possible(in_coreset: npt.NDArray[np.bool_], low: float, high: float) -> Bricks:
-    """Bricks with the values that a field of a coreset may have: a range, with a margin."""
-    bricks = Bricks.of(
-        Frame(values=np.where(in_coreset, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
-    )
-    has_value = bricks.low <= bricks.high
-    low, high = (float(np.float32(end)) for end in (2 * low - high, 2 * high - low))
-    return replace(
-        bricks,
-        low=np.where(has_value, np.float32(low), np.float32(np.inf)),
-        high=np.where(has_value, np.float32(high), np.float32(-np.inf)),
-        value_range=(low, high) if has_value.any() else (0.0, 0.0),
-    )
 
 
 class WarpedField:

@@ -40,6 +40,7 @@ from fhash_codec.rendering.march_task import (
     resampled,
 )
 from fhash_codec.volume import Volume
+from fhash_formats.support.threads import in_threads
 from fhash_formats.support.values import Mask, Single
 
 BLOCK = 64
@@ -130,6 +131,11 @@ class TiledFrame:
         """Decode all that is not decoded yet."""
         for blocks in _boxes(~self.decoded):
             self._decode(blocks)
+
+    def layers(self, blocks: Mask) -> Iterator[tuple[int, int]]:
+        """Layers of the frame, from the first to before the last, that some of its blocks have."""
+        for number in np.flatnonzero(blocks.any(axis=(1, 2))):
+            yield int(self.starts[0][number]), int(self.starts[0][number + 1])
 
     def decode(self, block: tuple[int, ...]) -> None:
         """Decode a block (z, y, x), if no thread has; wait for one that does."""
@@ -222,6 +228,14 @@ def _blocks_of(
     return first, last
 
 
+def _reached(
+    first: npt.NDArray[np.int64], last: npt.NDArray[np.int64], bricks: npt.NDArray[np.int64]
+) -> list[npt.NDArray[np.int64]]:
+    """The blocks along an axis that bricks reach, as `_blocks_of` has them: arrays like theirs."""
+    most = int((last - first).max())
+    return [np.minimum(first[bricks] + n, last[bricks]) for n in range(most + 1)]
+
+
 def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:
     """Decode a region of the feature bounding box as a marcher takes it.
 
@@ -255,6 +269,7 @@ class Fetching:
     matter to every ray.
 
     Attributes:
+        tiles: the frame.
         fields: of `FhashMarch`, by name.
         error: what a block failed by, None if none did.
     """
@@ -277,7 +292,7 @@ class Fetching:
             by: what rays leap by: 'distance' or 'highest', '' for no leaps.
             smoothing: deviation and largest error of the values that shade, None for the frame's.
         """
-        self._tiles, self._task, self._by, self._smoothing = tiles, task, by, smoothing
+        self.tiles, self._task, self._by, self._smoothing = tiles, task, by, smoothing
         shape = tiles.bricks.low.shape
         self._first, self._last = zip(
             *(_blocks_of(starts, n, margin) for starts, n in zip(tiles.starts, shape, strict=True)),
@@ -297,6 +312,18 @@ class Fetching:
         if tiles.decoded.any():
             self._update([(0, n) for n in shape])
 
+    def fetch(self, bricks: npt.NDArray[np.int64]) -> None:
+        """Decode what the samples in bricks read, numbers in a flat array, in several threads."""
+        try:
+            wanted = np.zeros(self.tiles.decoded.shape, bool)
+            places = np.unravel_index(bricks, self._ready.shape)
+            for blocks in product(*map(_reached, self._first, self._last, places)):
+                wanted[blocks] = True
+            list(in_threads(self.tiles.decode, list(zip(*np.nonzero(wanted), strict=True))))
+            self._update([(0, n) for n in self._ready.shape])
+        except BaseException as error:  # it is raised again where the march ends
+            self.error = error
+
     def _fetch(self, brick: int) -> int:
         """Decode what the samples in a brick read. Returns 1 where that failed, now or before."""
         if self.error is not None:
@@ -308,9 +335,9 @@ class Fetching:
                 for first, last, n in zip(self._first, self._last, place, strict=True)
             ]
             blocks = list(product(*(range(first, last + 1) for first, last in ends)))
-            new = [block for block in blocks if not self._tiles.decoded[block]]
+            new = [block for block in blocks if not self.tiles.decoded[block]]
             for block in blocks:
-                self._tiles.decode(block)
+                self.tiles.decode(block)
             # Of bricks that read a new block; of this one where other threads have decoded all.
             ends = [(min(along), max(along)) for along in zip(*new, strict=True)]
             self._update(
@@ -328,7 +355,7 @@ class Fetching:
 
     def _update(self, bricks: Spans) -> None:
         """Look again at bricks, some of which have become ready."""
-        part, tiles = _slices(bricks), self._tiles
+        part, tiles = _slices(bricks), self.tiles
         with tiles.lock:
             ready = tiles.decoded
             for axis, along in enumerate(part):
@@ -367,7 +394,7 @@ class Fetching:
         deviation, error = self._smoothing
         inner = brick_vertices(bricks, 1)
         outer = brick_vertices(bricks, 1 + reach_of(deviation))
-        values = np.ascontiguousarray(self._tiles.frame.values[outer])
+        values = np.ascontiguousarray(self.tiles.frame.values[outer])
         inside = tuple(
             slice(a.start - b.start, a.stop - b.start) for a, b in zip(inner, outer, strict=True)
         )

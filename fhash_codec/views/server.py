@@ -14,9 +14,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar, runtime_checkable
 from urllib.parse import unquote, urlsplit
 
 from fhash_formats.errors import FhashError, InputError
@@ -100,6 +101,9 @@ BUSY = "\r\n".join(
 """The answer to a connection beyond MAX_CONNECTIONS."""
 NEWS = Callable[[str], None]
 """Is told a line for each answer that is an error of the server."""
+Answer = tuple[HTTPStatus, dict[str, str], bytes]
+"""Status, headers and body."""
+Result = TypeVar("Result")
 
 
 class View(Protocol):
@@ -121,6 +125,14 @@ class View(Protocol):
         """Yield the bytes of a key that there is, from `first` to before `end`."""
 
 
+@runtime_checkable
+class Answering(Protocol):
+    """A view whose bytes are made for each request, such as pictures."""
+
+    def answer(self, key: str, query: str) -> Answer:
+        """The answer to a key with the text after its `?`; called in several threads at once."""
+
+
 class Server(ThreadingHTTPServer):
     """A server of one view; several clients are served at once.
 
@@ -139,7 +151,7 @@ class Server(ThreadingHTTPServer):
 
     def __init__(
         self,
-        view: View,
+        view: View | Answering,
         *,
         host: str = "127.0.0.1",
         port: int = 0,
@@ -248,7 +260,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(body=True)
 
     def do_HEAD(self) -> None:
-        """Answer with the headers of a key; nothing is decoded."""
+        """Answer with the headers of a key; nothing is decoded but for an `Answering` view."""
         self._answer(body=False)
 
     def do_OPTIONS(self) -> None:
@@ -295,7 +307,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, *, body: bool) -> None:
         view = self.server.view
-        key = unquote(self.path.partition("?")[0]).removeprefix("/")
+        path, _, query = self.path.partition("?")
+        key = unquote(path).removeprefix("/")
+        if isinstance(view, Answering):
+            if (answer := self._tried(key, partial(view.answer, key, query))) is not None:
+                status, headers, data = answer
+                headers = {"Cache-Control": "no-store", **headers}
+                self._send(status, data if body else b"", headers=headers, length=len(data))
+            return
         size = view.size(key)
         if size is None:
             self._tell(HTTPStatus.NOT_FOUND, view.hint.format(url=self.server.url))
@@ -329,7 +348,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(status, headers=headers, length=end - first)
             return
         pieces = view.pieces(key, first, end)
-        start = self._first(key, pieces)
+        start = self._tried(key, partial(next, pieces, b""))
         if start is not None:
             self._send(status, start, headers=headers, length=end - first)
             sent = len(start)
@@ -338,10 +357,10 @@ class _Handler(BaseHTTPRequestHandler):
                 sent += len(piece)
             self.close_connection |= sent != end - first  # of a file that was cut meanwhile
 
-    def _first(self, key: str, pieces: Iterator[bytes | memoryview]) -> bytes | memoryview | None:
-        """The first piece of a key; None where it could not be had, which the client was told."""
+    def _tried(self, key: str, make: Callable[[], Result]) -> Result | None:
+        """The result of work for a key; None where it failed, which the client was told."""
         try:
-            return next(pieces, b"")
+            return make()
         except FhashError as error:
             line = str(error)
         except MemoryError:

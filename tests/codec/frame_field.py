@@ -25,9 +25,7 @@ def field_of(frame: Frame, grid: Grid, arrays: Arrays = NUMPY) -> FrameField:
     return FrameField(frame, Bricks.of(frame), grid, arrays)
 
 
-def by_stream(
-    library: object, frame: Frame, task: Task, bricks: Bricks, *_: object, **__: object
-) -> Marched:
+def by_stream(frame: Frame, task: Task, bricks: Bricks, *_: object, **__: object) -> Marched:
     """A stand-in for `march_native`."""
     marched = stream(FrameField(frame, bricks, task.rays.grid), task, adaptive=True)
     # Looking up a decoded frame is not an evaluation of a model.

@@ -124,7 +124,7 @@ def test_a_plain_install_encodes_decodes_renders_and_verifies(site: Path, tmp_pa
     [
         (
             ("encode", "run.npy", "-o", "paper.fhz", "--preset", "published", "--device", "cuda"),
-            "fhash[cuda]",
+            "fhash[torch]",
         ),
         (("bench", "rate", "run.npy"), "fhash[bench]"),
         (("decode", "run.fhz", "--isosurface", "0.5", "-o", "surface.ply"), "fhash[mesh]"),

@@ -8,17 +8,19 @@ import subprocess
 import sys
 import tempfile
 import webbrowser
+from contextlib import closing
 from pathlib import Path
-from typing import Annotated, TypedDict
+from typing import Annotated, Any, TypedDict
 from xml.sax.saxutils import quoteattr
 
 import click
 from click.shell_completion import get_completion_class
 
-from fhash_cli.options import BaseCommand, force_option, json_option
+from fhash_cli.options import BaseCommand, force_option, json_option, variable_option
 from fhash_cli.output import emit, one_line, say, size, table
 from fhash_formats.errors import MissingDependencyError, OutputError
 from fhash_formats.native import FOLDER
+from fhash_formats.support.files import file_name
 
 PORT = 8643
 """Port unless another is asked for."""
@@ -44,7 +46,7 @@ class Written(TypedDict):
 @click.command(
     "view",
     cls=BaseCommand,
-    epilog="fhash view run.fhz\nfhash view run.fhz --static site",
+    epilog="fhash view run.fhz\nfhash view run.fhz --live\nfhash view run.fhz --static site",
 )
 @click.argument("runs", metavar="RUN.fhz...", nargs=-1, required=True, type=click.Path())
 @click.option(
@@ -63,6 +65,14 @@ class Written(TypedDict):
     help="Write page and containers into DIR, for any web server, and serve nothing.",
 )
 @click.option("--no-browser", is_flag=True, help="Open no browser.")
+@click.option("--live", is_flag=True, help="Draw here, and send pictures instead of RUN.fhz.")
+@click.option(
+    "--device",
+    type=click.Choice(("auto", "cpu", "cuda")),
+    default="auto",
+    help="Where --live draws; auto: on a GPU if there is one.",
+)
+@variable_option
 @force_option
 @json_option
 def view_command(
@@ -70,17 +80,32 @@ def view_command(
     port: int,
     folder: str | None,
     no_browser: bool,
+    live: bool,
+    device: str,
+    variable: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
     """Show RUN.fhz in a browser: volume rendering, slices, time.
 
     A server of this machine alone gives the page and RUN.fhz, no other file, until Ctrl-C. The
-    browser decodes, and reads only what it shows.
+    browser decodes, and reads only what it shows. With --live this machine decodes and draws.
     """
     from fhash_codec.views.page import Page
-    from fhash_codec.views.server import Server
 
+    if live:
+        from fhash_codec.views.live import Live
+        from fhash_codec.volume import open as open_volume
+
+        if len(runs) > 1 or folder is not None or force:
+            raise click.UsageError("--live shows one RUN.fhz, without --static and --force")
+        with (
+            open_volume(runs[0], variable=variable) as volume,
+            closing(Live(volume, device=device)) as view,
+        ):
+            return _serve(view, [file_name(runs[0])], port, no_browser, as_json)
+    if device != "auto" or variable is not None:
+        raise click.UsageError("--device and --var are of --live: give --live too")
     page = Page(runs)
     if folder is not None:
         outputs = page.write(folder, force=force)
@@ -91,15 +116,17 @@ def view_command(
         ]
         files = [str(output) for output in outputs]
         report: Written = {"folder": folder, "files": files, "bytes": written}
-        emit(report, table(rows), as_json)
-        return
-    with Server(page, port=port, news=say) as server:
-        shown: Shown = {"url": server.url, "files": list(page.runs)}
-        emit(
-            shown,
-            f"{one_line(', '.join(page.runs))} at {server.url}\nCtrl-C ends it.",
-            as_json,
-        )
+        return emit(report, table(rows), as_json)
+    return _serve(page, list(page.runs), port, no_browser, as_json)
+
+
+def _serve(view: Any, names: list[str], port: int, no_browser: bool, as_json: bool) -> None:
+    """Serve a `Page` or `Live` of containers with these names until Ctrl-C."""
+    from fhash_codec.views.server import Server
+
+    with Server(view, port=port, news=say) as server:
+        shown: Shown = {"url": server.url, "files": names}
+        emit(shown, f"{one_line(', '.join(names))} at {server.url}\nCtrl-C ends it.", as_json)
         if sys.stdout is not None:
             sys.stdout.flush()
         if not no_browser:

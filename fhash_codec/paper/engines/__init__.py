@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import ENGINES
-from fhash_codec.devices import need_torch
+from fhash_codec.cuda.nvrtc import Unavailable
+from fhash_codec.devices import first_line, need_torch
+from fhash_codec.progress import tell
 from fhash_formats.errors import InputError
 from fhash_formats.support.values import Single
 
@@ -72,27 +74,33 @@ def make_engine(
     """Return a new engine.
 
     Args:
-        name: fused, native, or auto for fused on CUDA where it can be had, else native.
+        name: fused, native, or auto for fused on CUDA and native on a CPU.
         architecture: the sizes of the model.
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
         seed: seed of the initial parameters.
-        device: 'cpu' or 'cuda', where the engine computes.
+        device: 'cpu' or 'cuda', where the engine computes, or 'auto' for CUDA unless the kernels
+            cannot be had or cannot do the model, which the stage `engine` then says.
 
     Raises:
         InputError: the name is unknown, or the engine cannot be had or does not take the model.
-
-    Warns (FhashWarning) where the CPU trains though the device is CUDA.
     """
-    if name == "fused" or (name == "auto" and device == "cuda"):
+    if name == "fused" or (name == "auto" and device != "cpu"):
+        if device == "cpu":
+            raise InputError(
+                "engine is 'fused', which needs a CUDA device, but the device is 'cpu';"
+                " use --engine auto"
+            )
         need_torch(f"device '{device}'" if name == "auto" else "engine 'fused'")
         from fhash_codec.paper.engines.fused.engine import start_fused
 
-        fused = start_fused(
-            architecture, coreset, rates, seed=seed, device=device, required=name == "fused"
-        )
-        if fused is not None:
-            return fused
+        try:
+            return start_fused(architecture, coreset, rates, seed=seed)
+        except Unavailable as error:
+            reason = f"engine 'fused' cannot be had: {first_line(error)}"
+            if name == "fused" or device == "cuda":
+                raise InputError(f"{reason}; use --engine auto --device cpu") from error
+        tell("engine", f"tables and network at their random start, on the CPU, as {reason}")
         device = "cpu"
     if name in ("auto", "native"):
         from fhash_codec.paper.engines.native import NativeEngine

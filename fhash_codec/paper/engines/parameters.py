@@ -403,8 +403,16 @@ def needed_bytes(architecture: Architecture, coreset: Coreset) -> int:
     """
     bricks, samples = len(coreset.bricks), len(coreset.values)
     network = sum(outputs * (inputs + 1) for outputs, inputs in architecture.layer_shapes)
-    # Embeddings, mean and square of the finest level; values, masks, offsets and coordinates.
-    held = 12 * architecture.embedding_size * samples + 4 * samples + coreset.mask_bits.nbytes
-    held += bricks * (8 + 8 + 4 * 8)
+    size, lattice = architecture.embedding_size, coreset.lattice
+    numbers = architecture.coarse_numbers
+    # Values, masks, offsets and coordinates.
+    held = 4 * samples + coreset.mask_bits.nbytes + bricks * (8 + 8 + 4 * 8)
+    if lattice is None:
+        # Embeddings, mean and square of the finest level.
+        held += 12 * size * samples
+    else:
+        # What bricks reach of the finest table at their key frame and the next.
+        corners = 2 * len(lattice.bricks) * prod(length + 1 for length in lattice.brick_shape)
+        numbers += min(architecture.parameters_of_finest, corners * size)
     # Four vectors of the numbers in use, and their places.
-    return LIBRARIES + held + architecture.coarse_numbers * (4 * 4 + 4) + 16 * network
+    return LIBRARIES + held + numbers * (4 * 4 + 4) + 16 * network

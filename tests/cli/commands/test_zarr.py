@@ -168,10 +168,46 @@ def test_the_page_is_served_until_it_is_stopped(run: Path) -> None:
     assert (process.returncode, out, err) == (0, "", "fhash: stopped\n")
 
 
+def test_live_pictures_are_served_until_it_is_stopped(run: Path) -> None:
+    words = [*MAIN[:-1], "view", str(run), "--live", "--port", "0", "--no-browser", "--json"]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        told = json.loads(process.stdout.readline())
+        assert told["files"] == [run.name]
+        assert run.name.encode() in opened(told["url"])
+        picture = opened(told["url"] + "picture?width=64&height=48&azimuth=20")
+        assert picture[:8] == b"\x89PNG\r\n\x1a\n"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "", "fhash: stopped\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--live", "--static", "site"], "--live shows one RUN.fhz, without --static and --force"),
+        (["--live", "--force"], "--live shows one RUN.fhz"),
+        (["another.fhz", "--live"], "--live shows one RUN.fhz"),
+        (["--device", "cpu"], "give --live too"),
+        (["--var", "density"], "give --live too"),
+        (["--live", "--device", "gpu"], "'gpu' is not one of 'auto', 'cpu', 'cuda'"),
+        (["--live", "--var", "u"], "no variable 'u'"),
+    ],
+)
+def test_options_that_exclude_each_other(
+    refused: Refused, run: Path, words: list[str], message: str
+) -> None:
+    assert message in refused(2, "view", run, *words)
+
+
 def test_what_cannot_be_viewed_is_told_in_one_line(refused: Refused, tmp_path: Path) -> None:
     other = tmp_path / "other.fhz"
     other.write_bytes(b"no container")
     refused(4, "view", other)
+    refused(4, "view", other, "--live")
+    refused(2, "view", tmp_path / "none.fhz", "--live")
     refused(2, "view", tmp_path / "none.fhz")
     refused(2, "view", "https://example.org/run.fhz")
 

@@ -6,7 +6,6 @@ import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact import head as training
 from fhash_codec.compact.head import LEAST_GAIN, likely_widths
-from fhash_codec.compact.head_device import DeviceLearner, learner_on
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     BLOCK_VOXELS,
@@ -136,17 +134,6 @@ def test_the_bits_of_training_are_fixed(rounded: bool, threads: int) -> None:
     assert digest[:16] == DIGESTS[rounded]
 
 
-@pytest.mark.torch
-@pytest.mark.parametrize("rounded", [False, True])
-def test_a_device_trains_the_same_bits(rounded: bool) -> None:
-    data = voxels(2, 3)
-    here, there = network(), network()
-    here.learn(data, 1, *factors(30), rounded=rounded)
-    DeviceLearner(data, "cpu").learn(there, 1, *factors(30), rounded)
-    for name in ("parameters", "means", "squares"):
-        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
-
-
 DIGESTS = {False: "ddaaf270cd9038d7", True: "804d969ac5100df2"}
 
 
@@ -228,19 +215,6 @@ def test_the_same_seed_gives_the_same_head(front: tuple[Floats, Floats]) -> None
         for budget in budgets
     ]
     assert runs[0] == runs[1] != runs[2]
-
-
-@pytest.mark.torch
-def test_training_on_cuda_gives_the_head_of_the_cpu(front: tuple[Floats, Floats]) -> None:
-    from pretended_cuda import pretended_cuda
-
-    pair, budget = Pair(*front, None), Budget(updates=40, samples=40_000)
-    here = train_head([pair], -1.0, 2.0, (24, 16), budget)
-    with pretended_cuda() as pretended:
-        on_cuda = replace(budget, learner=learner_on("cuda"))
-        there = train_head([pair], -1.0, 2.0, (24, 16), on_cuda)
-    assert pretended.counts["launches"] > 40
-    assert here.head.to_bytes() == there.head.to_bytes()
 
 
 def test_voxels_that_do_not_count_do_not_matter(front: tuple[Floats, Floats]) -> None:

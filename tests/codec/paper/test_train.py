@@ -260,6 +260,15 @@ def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_pat
         train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
 
 
+def test_a_model_that_kernels_for_cuda_cannot_do_is_refused_there(
+    coreset, architecture, tmp_path
+) -> None:
+    """Without torch, too; the CPU does it."""
+    large, config = replace(architecture, embedding_size=30), replace(CONFIG, device="cuda")
+    with pytest.raises(InputError, match=r"'cuda', but the network has 180 inputs, .*; use --"):
+        train_model(coreset, large, config, tmp_path / "a.fhz")
+
+
 GOAL = Goal(psnr=45.5, promised=45.0, seconds=100.0)
 
 

@@ -10,23 +10,46 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from emulated_cuda import EmulatedDevice
 from frame_field import blobs, by_stream, field_of, frame_of, table_of, task_of
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.light import light_grid
-from fhash_codec.rendering.march_task import Arrays, Lighting, Surface, Task
+from fhash_codec.rendering.march import march_native
+from fhash_codec.rendering.march_device import DeviceMarcher
+from fhash_codec.rendering.march_task import Arrays, Lighting, Marched, Surface, Task
 from fhash_codec.rendering.scenes import Camera
 from fhash_codec.rendering.stream_fields import Field, NetworkField
 from fhash_codec.rendering.tiled_frame import FrameField, decoded_frame
 
 
-@pytest.fixture(params=["native", "streamed"])
+@pytest.fixture(scope="session")
+def kernels_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the emulated kernels, each compiled once."""
+    return tmp_path_factory.mktemp("kernels")
+
+
+@pytest.fixture
+def emulated_marcher(kernels_folder: Path) -> DeviceMarcher:
+    """A device that draws, emulated on the processor; skipped without g++."""
+    return DeviceMarcher(EmulatedDevice(kernels_folder), threads=32)
+
+
+@pytest.fixture(params=["native", "streamed", "kernels"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Both marchers through a decoded frame: the native one, and the streamed one of networks."""
+    """The marchers through a decoded frame: on the processor, streamed, and on a device."""
+    place = "fhash_codec.rendering.march.march_native"
     if request.param == "streamed":
-        monkeypatch.setattr("fhash_codec.rendering.march.march_native", by_stream)
+        monkeypatch.setattr(place, by_stream)
+    if request.param == "kernels":
+        marcher = request.getfixturevalue("emulated_marcher")
+
+        def on_device(*arguments: Any, **settings: Any) -> Marched:
+            return march_native(*arguments, **{**settings, "device": marcher})
+
+        monkeypatch.setattr(place, on_device)
     return str(request.param)
 
 

@@ -493,7 +493,7 @@ def path(request):
 
 def marched(values, task, path=0, first=(0, 0, 0)):
     frame = frame_of(values, first=first)
-    return march_native(native.library(), frame, task, Bricks.of(frame), path=path)
+    return march_native(frame, task, Bricks.of(frame), path=path)
 
 
 def task_of_native_march(shape, extinctions, **more):

@@ -140,7 +140,7 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
             {"effects": {"shading": {"light": [0, 0, 1]}, "shadows": {"light": [0, 1, 1]}}},
             "one lamp",
         ),
-        ({"march": {"mode": "cache", "device": "cuda"}}, "march 'cache' computes on the CPU"),
+        ({"march": {"mode": "cache", "device": "cuda"}}, "there is no CUDA device here"),
         ({"march": {"device": "gpu"}}, "allowed: auto, cpu, cuda"),
         ({"camera": {"position": [1, 1, 1], "focal_point": [1, 1, 1]}}, "are the same"),
         ({"camera": {"view_up": [0, 0, 0]}}, "no length"),
@@ -205,14 +205,14 @@ def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None
 
 
 @pytest.mark.parametrize(
-    ("march", "gpu", "mode"),
+    ("march", "gpu", "mode", "device"),
     [
-        ({}, True, "arm"),
-        ({}, False, "cache"),
-        ({"device": "cpu"}, True, "cache"),
-        ({"mode": "cache"}, True, "cache"),
-        ({"mode": "arm"}, False, "arm"),
-        ({"device": "cuda"}, False, "arm"),
+        ({}, True, "arm", "cuda"),
+        ({}, False, "cache", "cpu"),
+        ({"device": "cpu"}, True, "cache", "cpu"),
+        ({"mode": "cache"}, True, "cache", "cuda"),
+        ({"mode": "arm"}, False, "arm", "cpu"),
+        ({"device": "cuda"}, True, "arm", "cuda"),
     ],
 )
 def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
@@ -222,15 +222,15 @@ def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
     march: dict[str, str],
     gpu: bool,
     mode: str,
+    device: str,
 ) -> None:
-    def arrays_on(device: str) -> object:
-        return object() if gpu and device == "auto" else NUMPY
-
-    monkeypatch.setattr("fhash_codec.rendering.plan.arrays_on", arrays_on)
+    module = "fhash_codec.rendering.plan"
+    monkeypatch.setattr(f"{module}.has_device", lambda: gpu)
+    monkeypatch.setattr(f"{module}.CUDA_START", 0.0)  # any picture pays
     with fhash_codec.open(files["paper"]) as network:
         planned = plan(network, march=march)
-    assert planned.mode == mode
-    if march.get("mode", "auto") != "arm" and march.get("device") != "cuda":
+    assert (planned.mode, planned.device) == (mode, device)
+    if march.get("mode", "auto") != "arm":
         assert plan(volume, march=march).mode == "cache"
     line = planned.to_dict()["march"]
     assert line.startswith(f"{mode}: ")
@@ -239,13 +239,34 @@ def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
     assert ("fastest on a CPU" in line) == (chosen and mode == "cache")
 
 
+def test_a_device_is_taken_where_its_start_pays(
+    volume: Volume, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = "fhash_codec.rendering.plan"
+    monkeypatch.setattr(f"{module}.usable_threads", lambda: 4)
+    scene = Scene.from_dict({"size": [512, 512]})
+    assert plan_picture(volume, scene).why_device == "there is no CUDA device"
+    with pytest.raises(InputError, match="no CUDA device here; use --device cpu"):
+        plan(volume, march={"device": "cuda"})
+    monkeypatch.setattr(f"{module}.has_device", lambda: True)
+    one, many = (plan_picture(volume, scene, pictures=count) for count in (1, 1000))
+    assert (one.device, many.device) == ("cpu", "cuda")
+    grid = one.task.rays.grid
+    longest = np.linalg.norm((np.array(grid.counts) - 1) * grid.spacing) / one.task.step
+    width, height = one.task.rays.size
+    seconds = width * height * longest / 2 / (4 * 4e7)
+    assert f"about {seconds:.2g} s, and CUDA takes" in one.why_device
+    assert f"about {1000 * seconds:.2g} s for 1000 pictures, and" in many.why_device
+    assert one.to_dict()["device"] == f"cpu: {one.why_device}"
+
+
 @pytest.mark.parametrize("few", [True, False])
 def test_auto_is_arm_on_a_cpu_where_all_samples_cost_less_than_the_frame(
     tmp_path: Path, volume: Volume, monkeypatch: pytest.MonkeyPatch, few: bool
 ) -> None:
     """Both sides of the number; a compact file, and light, need the frame in any case."""
     module = "fhash_codec.rendering.plan"
-    monkeypatch.setattr(f"{module}.arrays_on", lambda device: NUMPY)
+    monkeypatch.setattr(f"{module}.has_device", lambda: False)
     path = tmp_path / "a.fhz"
     field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
     fhash_codec.encode(

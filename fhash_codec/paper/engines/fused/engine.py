@@ -40,7 +40,7 @@ from fhash_codec.paper.engines.parameters import (
 )
 from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, time_nodes
 from fhash_codec.paper.network import Architecture, Network, Resolution, parameter_count
-from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.errors import FhashWarning
 from fhash_formats.support.values import Single
 
 TRIAL_BRICKS = 4
@@ -60,10 +60,12 @@ class FusedEngine:
 
     The finest embeddings are stored for the samples alone, brick by brick. Adam visits just the
     bricks of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on
-    its missing steps, whose gradient is zero, in closed form (`parameters.catch_up`).
+    its missing steps, whose gradient is zero, in closed form (`parameters.catch_up`). Samples
+    between key frames lie on no vertex of the finest table: it is then one more coarse level, and
+    no embedding is stored for the samples.
 
     Attributes:
-        fine: finest embeddings (E, samples) in the order of `Coreset.values`; `fine_mean` and
+        fine: finest embeddings (E or 0, samples) in the order of `Coreset.values`; `fine_mean` and
             `fine_square` are their moments of Adam.
         visited: number of the last training step that used each brick, 0 for none, int64 (bricks,)
             on the host.
@@ -94,7 +96,7 @@ class FusedEngine:
         """
         self._sizes, axes = kernel_sizes(architecture, coreset, kernels.limits)
         self._program = kernels.load(self._sizes)
-        self.architecture, self.coreset, self.rates = architecture, coreset, rates
+        self.architecture, self.coreset = architecture, coreset
         self.device, self._seed = device, seed
         self._counts = np.diff(coreset.offsets)
 
@@ -127,14 +129,24 @@ class FusedEngine:
         self._axes = [
             [sent(table) for table in (axis.start, axis.before, axis.after)] for axis in axes
         ]
-        self._missed = [sent(table) for table in missed_step_tables(rates)]
+        self.rates = rates
         limits = kernels.limits
         self._slots = self._sizes.slots(limits, 2)
         self._matrix_gradients = torch.empty(self._slots * self._sizes.matrices, device=device)
         self._errors = torch.empty(self._slots, dtype=torch.float64, device=device)
-        self._record = self._model()
         if self._program.new:
             self._try_kernels()
+
+    @property
+    def rates(self) -> npt.NDArray[np.float64]:
+        """Learning rate of every training step, counted from 1."""
+        return self._rates
+
+    @rates.setter
+    def rates(self, rates: npt.NDArray[np.float64]) -> None:
+        self._rates = rates
+        self._missed = [_sent(table, self.device) for table in missed_step_tables(rates)]
+        self._record = self._model()
 
     @torch.no_grad()
     def train(self, chosen: Chosen) -> Tensor:
@@ -293,7 +305,9 @@ class FusedEngine:
         reason = refusal(self.architecture)
         if reason is not None:
             raise Unavailable(f"the engine native cannot try the kernels: {reason}")
-        bricks = np.arange(min(TRIAL_BRICKS, len(self.visited)))
+        # The first ones lie at a key frame, the last ones between two, if any do.
+        last = len(self.visited) - 1
+        bricks = np.unique(np.linspace(0, last, TRIAL_BRICKS, dtype=np.int64))
         # In the third step the first brick catches up.
         batches = [batch for batch in (bricks, bricks[1:], bricks) if len(batch)][
             : len(self.rates) - 1
@@ -355,7 +369,7 @@ def _pointer(tensor: Tensor | None) -> Any:
     return ffi.new("void **", _address(tensor))
 
 
-FILES = ("records.h", "network.cuh", "points.cu")
+FILES = ("records.h", "network.cuh", "levels.cuh", "points.cu")
 """The files of the kernels in the order in which they follow each other."""
 MAX_BLOCKS = 8
 """Blocks at most for each multiprocessor."""
@@ -636,42 +650,17 @@ def start_fused(
     rates: npt.NDArray[np.float64],
     *,
     seed: int,
-    device: str,
-    required: bool,
-) -> FusedEngine | None:
-    """Return a fused engine, or None, with one FhashWarning for each reason.
-
-    There is no warning where torch is not built for CUDA, which needs no engine of ours to be slow.
-
-    Args:
-        architecture, coreset, rates, seed, device: as in `make_engine`.
-        required: whether nothing else will do.
+) -> FusedEngine:
+    """Return a fused engine; arguments as in `make_engine`.
 
     Raises:
-        InputError: the engine is required and cannot be had.
+        Unavailable: kernels for CUDA cannot be had here, or cannot do the model.
     """
-    if device != "cuda" or torch.version.cuda is None:
-        if required:
-            raise InputError(
-                f"engine is 'fused', which needs a CUDA device, but the device is '{device}'"
-                " or torch is not built for CUDA; use --engine auto"
-            )
-        return None
-    cuda = torch.device(device)
-    try:
-        return FusedEngine(
-            architecture,
-            coreset,
-            rates,
-            seed=seed,
-            device=cuda,
-            kernels=program.CudaDevice(cuda),
-        )
-    except Unavailable as error:
-        if required:
-            raise InputError(f"engine 'fused' cannot be had: {error}; use --engine auto") from error
-        _warn_once(f"the CPU trains, since kernels for CUDA cannot be had: {error}")
-        return None
+    if torch.version.cuda is None:
+        raise Unavailable("torch is not built for CUDA")
+    device = torch.device("cuda")
+    kernels = program.CudaDevice(device)
+    return FusedEngine(architecture, coreset, rates, seed=seed, device=device, kernels=kernels)
 
 
 def start_points(network: Network, key: float, device: torch.device) -> FusedPoints | None:

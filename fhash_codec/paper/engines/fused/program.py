@@ -17,8 +17,10 @@ import torch
 from fhash_codec.cuda.device import Device, Kernels, first_device
 from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines.parameters import BETA1, BETA2, WINDOW, axis_matrices
+from fhash_codec.paper.engines.fused import refusal
+from fhash_codec.paper.engines.parameters import BETA1, BETA2, WINDOW, coarse_axes
 from fhash_codec.paper.network import Architecture
+from fhash_formats.support.values import Double, Longs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,24 +42,23 @@ class AxisTables:
 
 
 def axis_tables(architecture: Architecture, coreset: Coreset) -> list[AxisTables]:
-    """Return the tables of the axes t, z, y and x. A key frame is a run of one vertex along t."""
-    lengths, counts = (1, *coreset.brick_shape), (architecture.key_frames, *coreset.brick_grid)
+    """Return the tables of the axes t, z, y and x. A step is a run of one vertex along t."""
+    levels = coarse_axes(architecture, coreset)
+    lengths, counts = (1, *coreset.brick_shape), (len(coreset.key_places), *coreset.brick_grid)
     return [
-        _axis_tables(size, [level[axis] for level in architecture.levels[1:]], length, count)
-        for axis, (size, length, count) in enumerate(
-            zip(architecture.sizes, lengths, counts, strict=True)
-        )
+        _axis_tables([level.axes[axis] for level in levels], length, count)
+        for axis, (length, count) in enumerate(zip(lengths, counts, strict=True))
     ]
 
 
-def _axis_tables(size: int, resolutions: list[int], length: int, count: int) -> AxisTables:
-    """Return the tables of one axis; arguments as in `upsampling.axis_matrices`."""
+def _axis_tables(levels: list[tuple[Longs, Double]], length: int, count: int) -> AxisTables:
+    """Return the tables of one axis from its `axis_matrices` for each level."""
     corners = []
-    start = np.empty((count, len(resolutions)), np.int32)
-    before = np.empty((count, len(resolutions), length), np.int32)
-    after = np.zeros((count, len(resolutions), length), np.float32)
-    for level, resolution in enumerate(resolutions):
-        start[:, level], weights = axis_matrices(size, resolution, length, count)
+    start = np.empty((count, len(levels)), np.int32)
+    before = np.empty((count, len(levels), length), np.int32)
+    after = np.zeros((count, len(levels), length), np.float32)
+    for level, (starts, weights) in enumerate(levels):
+        start[:, level] = starts
         corners.append(weights.shape[2])
         first = (weights != 0).argmax(axis=2)
         second = np.minimum(first + 1, weights.shape[2] - 1)
@@ -100,12 +101,6 @@ COLUMNS = (128, 64, 32)
 """Vertices of a tile at most, in the order in which they are tried."""
 DRIVER_BYTES = 1024
 """Bytes of shared memory that the driver keeps of each block."""
-MAX_WIDTH = 128
-"""Largest width of a hidden layer."""
-MAX_INPUTS = 64
-"""Largest number of inputs of the layers."""
-MAX_LAYERS = 2
-"""Largest number of hidden layers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +214,8 @@ class KernelSizes(Sizes):
 
     Attributes:
         brick_shape: vertices of a brick (z, y, x).
-        corners: corners (t, z, y, x) of a brick's sub-lattice of each coarse level.
+        corners: corners (t, z, y, x) of a brick's sub-lattice of each interpolated level
+            (`coarse_levels`).
         sums_in_shared: whether the gradient by the layers is summed in shared memory.
     """
 
@@ -274,11 +270,12 @@ class KernelSizes(Sizes):
 
     def _constants(self) -> Iterator[str]:
         """Yield the lines that define the constants."""
-        model, levels = self.architecture, self.architecture.levels
+        model = self.architecture
+        levels = model.levels[len(model.levels) - len(self.corners) :]
         z, y, x = self.brick_shape
         yield from self.layer_constants()
         numbers = {
-            "COARSE": len(levels) - 1,
+            "COARSE": len(levels),
             "BRICK_Z": z,
             "BRICK_Y": y,
             "BRICK_X": x,
@@ -287,13 +284,13 @@ class KernelSizes(Sizes):
         }
         yield from (f"constexpr int {name} = {number};" for name, number in numbers.items())
         yield f"constexpr bool SUMS_IN_SHARED = {str(self.sums_in_shared).lower()};"
-        tables = [prod(level) * model.embedding_size for level in levels[1:]]
+        tables = [prod(level) * model.embedding_size for level in levels]
         yield _table("int", "TIME_CORNERS", [corners[0] for corners in self.corners])
         yield _table("int", "LATTICE_AT", _starts(self.lattice_sizes))
         yield _table("int", "ROW_AT", _starts(self.row_sizes))
         yield _table("long long", "TABLE_AT", _starts(tables))
         yield _rows("LATTICE_SHAPE", 3, [corners[1:] for corners in self.corners])
-        yield _rows("RESOLUTION", 4, levels[1:])
+        yield _rows("RESOLUTION", 4, levels)
 
 
 def kernel_sizes(
@@ -305,8 +302,6 @@ def kernel_sizes(
         Unavailable: the kernels cannot do this model on this device.
     """
     check_layers(architecture)
-    if coreset.lattice is not None:
-        raise Unavailable("samples between key frames lie on no vertex of the finest table")
     axes = axis_tables(architecture, coreset)
     corners = tuple(zip(*(axis.corners for axis in axes), strict=True))
     fitting = [
@@ -337,15 +332,8 @@ def kernel_sizes(
 
 def check_layers(architecture: Architecture) -> None:
     """Raise Unavailable for layers that the kernels cannot do."""
-    if architecture.width > MAX_WIDTH or architecture.hidden_layers > MAX_LAYERS:
-        raise Unavailable(
-            f"the network has {architecture.hidden_layers} hidden layers of {architecture.width};"
-            f" the kernels do {MAX_LAYERS} of {MAX_WIDTH} at most"
-        )
-    if architecture.inputs > MAX_INPUTS:
-        raise Unavailable(
-            f"the network has {architecture.inputs} inputs; the kernels do {MAX_INPUTS} at most"
-        )
+    if reason := refusal(architecture):
+        raise Unavailable(reason)
 
 
 def best_of(fitting: Sequence[SomeSizes], limits: DeviceLimits) -> SomeSizes:

@@ -58,7 +58,7 @@ def animate(
     animation, target = Animation.parse(words, volume), Target(output=output, **how)
     with pytest.MonkeyPatch.context() as patch:
         if draw is not None:
-            patch.setattr(film_module, "Renderer", lambda _: SimpleNamespace(render=draw))
+            patch.setattr(film_module, "Renderer", lambda *_, **__: SimpleNamespace(render=draw))
         return film_module.animate(volume, scene, animation, target)
 
 

@@ -15,12 +15,13 @@ from frame_field import CENTRAL, NETWORK_SCENES, SCENES, field_of
 from rarely import rarely
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume, native
+from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.rendering.bricks import Palette
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march, march_native
+from fhash_codec.rendering.march_device import DeviceMarcher
 from fhash_codec.rendering.march_task import (
     NUMPY,
     Arrays,
@@ -31,6 +32,7 @@ from fhash_codec.rendering.march_task import (
     Task,
     Units,
 )
+from fhash_codec.rendering.network_frame import network_frame
 from fhash_codec.rendering.plan import arrays_on
 from fhash_codec.rendering.stream_fields import (
     Beams,
@@ -45,7 +47,7 @@ from fhash_codec.rendering.stream_fields import (
 from fhash_codec.rendering.stream_march import Canvas, Events, stream
 from fhash_codec.rendering.tiled_frame import FrameField
 from fhash_formats.errors import InputError
-from fhash_formats.series import Coordinate
+from fhash_formats.series import ArraySeries, Coordinate
 
 FrameTask = Callable[..., tuple[FrameField, Task]]
 
@@ -231,25 +233,44 @@ def test_both_ways_make_one_picture_of_a_network_near_that_of_its_vertices(
     assert np.mean(np.abs(streamed - cache)) < 0.02
 
 
-@pytest.mark.parametrize("path", [2, *rarely(0, 1)])
-@pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
-def test_native_and_streamed_samples_of_a_network_make_one_picture(
-    files: dict[str, Path], planned: Planned, scene: dict[str, Any], path: int
-) -> None:
-    with fhash_codec.open(files["paper"]) as volume:
-        field, task = planned(volume, scene, NUMPY)
-        assert isinstance(field, NetworkField)
-        assert field.frame is not None
-        whole = not np.isnan(field.frame.values).any()
-        here = march_native(native.library(), field.frame, task, field.bricks, path=path)
-        there, plainly = (stream(field, task, adaptive=adaptive) for adaptive in (True, False))
-    np.testing.assert_array_equal(there.rgba, plainly.rgba)
+def by_packets(
+    volume: Volume, scene: dict[str, Any], task: Task, marcher: DeviceMarcher | None, path: int = 0
+) -> Marched:
+    """The march of a network's frame on the processor, or on a device."""
+    plan = Renderer(volume).plan(Scene.from_dict({"size": [40, 34], **scene}))
+    warp = task.rays.grid.warp
+    frame, bricks = network_frame(volume, plan.step, plan.units, warp, marcher)
+    return march_native(frame, task, bricks, path=path, device=marcher)
+
+
+def assert_one_picture(here: Marched, there: Marched) -> None:
+    """Compare colours, depths and normals of two marches through a network."""
     np.testing.assert_allclose(here.rgba, there.rgba, atol=5e-4)
     assert np.mean(np.abs(here.rgba - there.rgba)) < 2e-5
     assert here.rgba[..., 3].max() > 0.05
     for mine, other in ((here.depth, there.depth), (here.normal, there.normal)):
         if mine is not None and other is not None:
             np.testing.assert_allclose(mine, other, atol=2e-3)
+
+
+@pytest.mark.parametrize("path", [2, "kernels", *rarely(0, 1)])
+@pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
+def test_native_and_streamed_samples_of_a_network_make_one_picture(
+    files: dict[str, Path],
+    planned: Planned,
+    scene: dict[str, Any],
+    path: int | str,
+    request: pytest.FixtureRequest,
+) -> None:
+    marcher = request.getfixturevalue("emulated_marcher") if path == "kernels" else None
+    with fhash_codec.open(files["paper"]) as volume:
+        field, task = planned(volume, scene, NUMPY)
+        assert isinstance(field, NetworkField)
+        whole = not np.isnan(field.bricks.values).any()
+        here = by_packets(volume, scene, task, marcher, path if isinstance(path, int) else 0)
+        there, plainly = (stream(field, task, adaptive=adaptive) for adaptive in (True, False))
+    np.testing.assert_array_equal(there.rgba, plainly.rgba)
+    assert_one_picture(here, there)
     if not task.skipping and not task.surfaces:
         assert here.counters["samples"] == there.counters["samples"]
         assert here.counters["evaluations"] >= there.counters["evaluations"]
@@ -268,9 +289,8 @@ def test_native_samples_of_a_network_of_all_vertices(tmp_path: Path, planned: Pl
         }
         field, task = planned(volume, scene, NUMPY)
         assert isinstance(field, NetworkField)
-        assert field.frame is not None
-        assert not np.isnan(field.frame.values).any()
-        here = march(field.frame, task, bricks=field.bricks)
+        assert not np.isnan(field.bricks.values).any()
+        here = by_packets(volume, scene, task, None)
         there = stream(field, task, adaptive=True)
     assert here.rgba[..., 3].max() > 0.05
     np.testing.assert_allclose(here.rgba, there.rgba, atol=5e-4)
@@ -280,14 +300,54 @@ def test_native_march_tells_of_a_network_that_has_no_memory(
     files: dict[str, Path], planned: Planned
 ) -> None:
     with fhash_codec.open(files["paper"]) as volume:
-        field, task = planned(volume, {}, NUMPY)
-        assert isinstance(field, NetworkField)
-        assert field.frame is not None
-        assert field.frame.network is not None
-        broken = {**field.frame.network.fields, "network_path": 3}  # a path that no machine has
-        frame = replace(field.frame, network=replace(field.frame.network, fields=broken))
+        _, task = planned(volume, {}, NUMPY)
+        plan = Renderer(volume).plan(Scene(size=(40, 34)))
+        frame, bricks = network_frame(volume, plan.step, plan.units, None, None)
+        assert frame.network is not None
+        broken = {**frame.network.fields, "network_path": 3}  # a path that no machine has
+        frame = replace(frame, network=replace(frame.network, fields=broken))
         with pytest.raises(MemoryError):
-            march(frame, task, bricks=field.bricks)
+            march(frame, task, bricks=bricks)
+
+
+@pytest.mark.parametrize("way", ["native", "kernels"])
+@pytest.mark.parametrize("axis", ["z", "x"])
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"shading": True, "buffers": ["depth", "normal"]},
+        {"isosurfaces": [{"value": 0.5, "opacity": 0.7}, {"value": 0.8}]},
+        {"minimum_intensity": True},
+    ],
+    ids=["shaded", "surfaces", "minimum"],
+)
+def test_a_network_on_uneven_axes_is_marched_as_it_is_streamed(
+    tmp_path: Path,
+    effects: dict[str, Any],
+    axis: str,
+    way: str,
+    request: pytest.FixtureRequest,
+) -> None:
+    marcher = request.getfixturevalue("emulated_marcher") if way == "kernels" else None
+    places = {name: np.arange(count) / 1.0 for name, count in zip("zyx", (10, 9, 11), strict=True)}
+    places[axis] = np.cumsum(1 + 0.7 * np.sin(np.arange(len(places[axis]))))
+    z, y, x = np.meshgrid(*(at / at[-1] - 0.5 for at in places.values()), indexing="ij")
+    values = np.exp(-6 * (z * z + y * y + x * x)).astype(np.float32)[None].repeat(2, axis=0)
+    coords = {name: Coordinate(name=name, values=at) for name, at in places.items()}
+    config = fhash_codec.EncodeConfig(
+        preset="published", tables="float16", features=("interval:0.3:2",), epochs=30, width=8
+    )
+    fhash_codec.encode(ArraySeries(values, coords=coords), tmp_path / "u.fhz", config)
+    linear = {"range": [0, 1], "opacity": [[0, 0], [1, 0.8]]}
+    scene = {"size": [24, 20], "step": 1, "transfer_function": linear, "effects": effects}
+    with fhash_codec.open(tmp_path / "u.fhz") as volume:
+        plan = Renderer(volume).plan(Scene.from_dict(scene))
+        warp = plan.task.rays.grid.warp
+        assert warp is not None
+        network = NetworkField(volume, plan.step, plan.units)
+        here = by_packets(volume, scene, plan.task, marcher)
+        there = stream(WarpedField(network, warp), plan.task, adaptive=True)
+    assert_one_picture(here, there)
 
 
 def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:

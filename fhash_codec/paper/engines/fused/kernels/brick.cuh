@@ -149,7 +149,7 @@ __device__ inline Brick load_brick(
         if (weight != 0.f) value += weight * model.flat[second];
         at.lattice[i] = value;
     });
-    const CatchUp effect = catch_up(model, model.visited[id], step, at.parts);
+    const CatchUp effect = catch_up(model, FINE ? model.visited[id] : 0, step, at.parts);
     __syncthreads();
     return {id, model.offsets[id], effect};
 }
@@ -190,7 +190,7 @@ __device__ inline void load_inputs(
             *to = 1.f;
         } else if (column >= columns) {
             for (int e = 0; e < SIZE; e++) to[e * PITCH] = 0.f;
-        } else if (level == 0) {
+        } else if (FINE && level == 0) {
             const int vertex = first_row * BRICK_X + column;
             if (!is_sample(model, brick, vertex)) {
                 for (int e = 0; e < SIZE; e++) to[e * PITCH] = 0.f;
@@ -203,12 +203,12 @@ __device__ inline void load_inputs(
                     model.fine_square[place]);
             }
         } else {
-            const int x = (level - 1) * AXES_LENGTH + X_AT + column % BRICK_X;
+            const int x = (level - FINE) * AXES_LENGTH + X_AT + column % BRICK_X;
             const int corner = at.before[x];
             const float weight = at.after[x];
-            const int next = corner + 1 < LATTICE_SHAPE[level - 1][2] ? SIZE : 0;
+            const int next = corner + 1 < LATTICE_SHAPE[level - FINE][2] ? SIZE : 0;
             const float* row =
-                at.rows + column / BRICK_X * ROW + ROW_AT[level - 1] + corner * SIZE;
+                at.rows + column / BRICK_X * ROW + ROW_AT[level - FINE] + corner * SIZE;
             for (int e = 0; e < SIZE; e++)
                 to[e * PITCH] = (1.f - weight) * row[e] + weight * row[next + e];
         }
@@ -227,7 +227,7 @@ __device__ inline void transpose_rows(const Shared& at, int columns) {
         const int place = level * AXES_LENGTH + X_AT;
         for (int i = threadIdx.x; i < columns / BRICK_X * width; i += THREADS) {
             const int row = i / width, corner = i % width / SIZE, e = i % SIZE;
-            const float* down = at.inputs + ((level + 1) * SIZE + e) * PITCH + row * BRICK_X;
+            const float* down = at.inputs + ((level + FINE) * SIZE + e) * PITCH + row * BRICK_X;
             float sum = 0.f;
             for (int x = 0; x < BRICK_X; x++)
                 sum += weight_of(corner, at.before[place + x], at.after[place + x]) * down[x];

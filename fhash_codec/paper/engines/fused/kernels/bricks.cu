@@ -124,7 +124,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 512 / THREADS) train_brick
             __syncthreads();
             run_back(at, sums, last_sums);
             transpose_rows(at, columns);
-            move_fine(model, brick, at, first_row, columns, rate);
+            if (FINE) move_fine(model, brick, at, first_row, columns, rate);
             __syncthreads();
             add_transposed_rows(at, first_row, columns);
             __syncthreads();
@@ -216,7 +216,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) settle_bricks(
     for (int item = blockIdx.x; item < items; item += gridDim.x) {
         const long long id = first + item, visited = model.visited[id];
         const CatchUp effect = catch_up(model, visited, step, reinterpret_cast<float*>(memory));
-        if (visited > 0 && visited < step) {  // the same in all threads
+        if (FINE && visited > 0 && visited < step) {  // the same in all threads
             const long long first_sample = model.offsets[id];
             const int samples = static_cast<int>(model.offsets[id + 1] - first_sample);
             for (int i = threadIdx.x; i < SIZE * samples; i += THREADS) {

@@ -9,6 +9,8 @@
 // hidden neurons. A matrix of a layer has a row for each input, the row of the bias last, and its
 // outputs are padded to STRIDE numbers.
 
+// 1, or 0 where the finest level is interpolated, too, and nothing is stored for the samples.
+enum { FINE = LEVELS - COARSE };
 constexpr int VERTICES = BRICK_Z * BRICK_Y * BRICK_X;
 constexpr int BRICK_ROWS = BRICK_Z * BRICK_Y;
 constexpr int TILE_ROWS = COLUMNS / BRICK_X;

@@ -1,20 +1,23 @@
 """A program: emulated kernels under AddressSanitizer; a planted fault if asked.
 
-Arguments: the folder of the libraries, `bricks` for some steps of training or `points`, the number
-of hidden layers, and a text of the kernels with what replaces it, or nothing.
+Arguments: the folder of the libraries, `bricks` for some steps of training, `between` for one with
+samples between key frames or `points`, the number of hidden layers, and a text of the kernels with
+what replaces it, or nothing.
 """
 
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from emulator import EmulatedDevice, HeldTable
 
-from fhash_codec.features.bricks import build_coreset
+from fhash_codec.features.bricks import build_coreset, with_steps_between
 from fhash_codec.features.features import FeatureChoice, Interval
+from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines.fused.engine import FusedEngine, FusedPoints, PointKernels
 from fhash_codec.paper.network import Architecture, ArrayTable, Network
@@ -22,11 +25,14 @@ from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 
 
-def bricks(device: EmulatedDevice, layers: int) -> None:
+def bricks(device: EmulatedDevice, layers: int, keys: tuple[int, int] = (0, 1)) -> None:
     """Train and evaluate, with atomics and in a fixed order."""
-    series = ArraySeries(np.random.default_rng(3).random((2, 5, 9, 13), dtype=np.float32))
-    choice = FeatureChoice(range(2), [Interval(0.3, 1.0)])
-    coreset = build_coreset(series, scan(series, silent), choice, silent)
+    steps = keys[1] + 1
+    series = ArraySeries(np.random.default_rng(3).random((steps, 5, 9, 13), dtype=np.float32))
+    choice, scanned = FeatureChoice(keys, [Interval(0.3, 1.0)]), scan(series, silent)
+    coreset = build_coreset(series, scanned, choice, silent, fringe=True)
+    times = KeyTimes(times=np.arange(steps), key_frames=keys)
+    coreset = with_steps_between(coreset, series, scanned.value_range, times, silent)
     architecture = Architecture.for_box(coreset.box.shape, 2, width=12, hidden_layers=layers)
     engine = FusedEngine(
         architecture, coreset, np.full(9, 0.01), seed=7, device=torch.device("cpu"), kernels=device
@@ -70,7 +76,8 @@ def main(folder: str, kernels: str, layers: str, old: str = "", new: str = "") -
     device = EmulatedDevice(
         Path(folder), change=change, flags=("-fsanitize=address", "-g1"), order=3
     )
-    {"bricks": bricks, "points": points}[kernels](device, int(layers))
+    tried = {"bricks": bricks, "between": partial(bricks, keys=(0, 2)), "points": points}
+    tried[kernels](device, int(layers))
     print("done")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,11 @@ def emulated(library_folder):
 
 @pytest.fixture
 def engines_of(noise_coreset, emulated):
-    """A function of a shape, settings and a device: coreset, both engines, and the oracle."""
+    """A function of a shape, settings and a device: coreset, both engines, and the oracle.
+
+    Of the settings, `low` and `keys` are those of `noise_coreset`; `times` are the vertices along
+    time of the first levels, which are then all.
+    """
 
     import torch
     from readable_paper import NaiveEngine
@@ -45,10 +50,15 @@ def engines_of(noise_coreset, emulated):
     from fhash_codec.paper.engines.native import NativeEngine
 
     def make(shape, settings, steps=40, **device):
-        settings = dict(settings)
-        coreset = noise_coreset(shape, settings.pop("low", 0.3))
         settings = {"width": 16, **settings}
-        architecture = Architecture.for_box(coreset.box.shape, shape[0], **settings)
+        low, keys, times = (settings.pop(name, ()) for name in ("low", "keys", "times"))
+        coreset = noise_coreset(shape, low or 0.3, keys=keys, fringe=bool(keys))
+        architecture = Architecture.for_box(coreset.box.shape, len(coreset.key_frames), **settings)
+        if times:
+            levels = zip(times, architecture.levels, strict=False)
+            architecture = replace(
+                architecture, levels=tuple((t, *level[1:]) for t, level in levels)
+            )
         rates, cpu = np.full(steps + 1, 0.01), torch.device("cpu")
         fused = FusedEngine(
             architecture, coreset, rates, seed=7, device=cpu, kernels=emulated(**device)

@@ -19,11 +19,13 @@
 #define __global__
 #define __device__
 #define __constant__ static const
+#define __grid_constant__
 #define __launch_bounds__(...)
 #define __syncthreads() emulated::wait(__LINE__)
 #define FHASH_SHARED(name) float4* name = emulated::shared
 #define threadIdx (emulated::now->thread)
 #define blockIdx (emulated::block)
+#define blockDim (emulated::size)
 #define gridDim (emulated::grid)
 
 struct alignas(16) float4 {
@@ -49,7 +51,7 @@ inline std::vector<Fibre> fibres;
 inline Fibre* now;
 inline jmp_buf scheduler;
 inline ucontext_t scheduler_begin;
-inline Place block, grid;
+inline Place block, size, grid;
 inline std::function<void()> body;
 inline float4* shared;
 inline sigjmp_buf escape;
@@ -116,8 +118,11 @@ inline int launch(
     std::iota(turns.begin(), turns.end(), 0u);
     if (order == 1) std::reverse(turns.begin(), turns.end());
     std::mt19937 random(order);
+    size.x = threads;
     grid.x = blocks;
-    shared = static_cast<float4*>(std::aligned_alloc(16, std::max<std::size_t>(bytes, 16)));
+    void* memory = nullptr;
+    if (posix_memalign(&memory, 16, std::max<std::size_t>(bytes, 1))) return 3;
+    shared = static_cast<float4*>(memory);
     struct sigaction usual, ours = {};
     ours.sa_handler = at_wild_address;
     sigaction(SIGSEGV, &ours, &usual);
@@ -152,8 +157,69 @@ std::function<void()> bound(void (*kernel)(A...), void** arguments) {
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __popcll(unsigned long long bits) { return __builtin_popcountll(bits); }
 
-inline float atomicAdd(float* to, float number) {
-    const float old = *to;
+template <class T>
+T added(T* to, T number) {
+    const T old = *to;
     *to += number;
     return old;
 }
+
+inline float atomicAdd(float* to, float number) { return added(to, number); }
+inline double atomicAdd(double* to, double number) { return added(to, number); }
+inline int atomicAdd(int* to, int number) { return added(to, number); }
+inline unsigned atomicAdd(unsigned* to, unsigned number) { return added(to, number); }
+inline unsigned long long atomicAdd(unsigned long long* to, unsigned long long number) {
+    return added(to, number);
+}
+
+// Exchanges of a warp, which is all of a block here: between two barriers each thread writes a slot
+// of its own and reads others.
+namespace emulated {
+
+template <class T, class Read>
+auto exchanged(T own, const Read& read) {
+    static T slots[32];
+    static_assert(sizeof(T) <= 8);
+    slots[now->thread.x] = own;
+    wait(-1);
+    const auto result = read(slots);
+    wait(-2);
+    return result;
+}
+
+}  // namespace emulated
+
+inline unsigned __ballot_sync(unsigned, int holds) {
+    return emulated::exchanged(holds, [](const int* slots) {
+        unsigned bits = 0;
+        for (unsigned t = 0; t < emulated::size.x; t++) bits |= (slots[t] != 0) << t;
+        return bits;
+    });
+}
+
+inline int __any_sync(unsigned all, int holds) { return __ballot_sync(all, holds) != 0; }
+
+template <class T>
+T __shfl_sync(unsigned, T own, int from) {
+    return emulated::exchanged(own, [from](const T* slots) { return slots[from]; });
+}
+
+template <class T>
+T __shfl_down_sync(unsigned all, T own, unsigned away) {
+    const unsigned from = threadIdx.x + away;
+    return __shfl_sync(all, own, (int)(from < emulated::size.x ? from : threadIdx.x));
+}
+
+inline float __int_as_float(int bits) {
+    float number;
+    std::memcpy(&number, &bits, sizeof number);
+    return number;
+}
+
+inline double __longlong_as_double(long long bits) {
+    double number;
+    std::memcpy(&number, &bits, sizeof number);
+    return number;
+}
+
+inline int __ffs(unsigned bits) { return __builtin_ffs((int)bits); }

@@ -7,11 +7,12 @@
 
 // Returns what emulated::launch does; 2 for an unknown kernel.
 extern "C" int launch(
-    const char* name, unsigned blocks, std::size_t bytes, int order, void** arguments) {
+    const char* name, unsigned blocks, unsigned threads, std::size_t bytes, int order,
+    void** arguments) {
     using Bind = std::function<void()> (*)(void**);
     static const std::pair<const char*, Bind> kernels[] = {FHASH_KERNELS};
     for (const auto& [known, bind] : kernels)
         if (!std::strcmp(known, name))
-            return emulated::launch(blocks, THREADS, bytes, order, bind(arguments));
+            return emulated::launch(blocks, threads, bytes, order, bind(arguments));
     return 2;
 }

@@ -1,23 +1,17 @@
-"""A device that runs the kernels on the processor: g++ compiles their text with emulate.hpp."""
+"""A device that runs the kernels on the processor: see emulated_cuda.py."""
 
 from __future__ import annotations
 
-import re
-import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cffi
+from emulated_cuda import EmulatedKernels, compiled
 
-from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.paper.engines.fused.program import DeviceLimits, Sizes
 from fhash_codec.paper.network import ArrayTable, SparseFrame
 
-HERE = Path(__file__).parent
-FFI = cffi.FFI()
-FFI.cdef("int launch(const char* name, unsigned blocks, size_t bytes, int order, void** given);")
 LIMITS = DeviceLimits(
     multiprocessors=2,
     shared_per_block=160 << 10,
@@ -26,30 +20,27 @@ LIMITS = DeviceLimits(
     columns=(32,),
 )
 """A small device: several bricks for each block, and few fibres."""
-FAILURES = {1: "threads met at different barriers", 2: "unknown kernel", 3: "wild address"}
-"""Meaning of the answers of `launch` in emulated.cpp."""
 
 
 class EmulatedProgram:
-    """Kernels in a shared library. Threads run in `order`: 0 up, 1 down, else shuffled."""
+    """Kernels for some sizes, whose threads run in `order`."""
 
-    new = False
+    def __init__(self, kernels: EmulatedKernels, threads: int) -> None:
+        self.kernels, self.new, self._threads = kernels, kernels.new, threads
 
-    def __init__(self, library: Path, order: int) -> None:
-        self.library = FFI.dlopen(str(library))
-        self.order = order
-        self.launched: list[str] = []
-        self.forgotten = False
+    @property
+    def launched(self) -> list[str]:
+        return self.kernels.launched
+
+    @property
+    def forgotten(self) -> bool:
+        return self.kernels.forgotten
 
     def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
-        self.launched.append(kernel)
-        given = (kernel.encode(), blocks, shared_bytes, self.order, list(arguments))
-        answer = self.library.launch(*given)
-        if answer:
-            raise Unavailable(f"{kernel}: {FAILURES[answer]}")
+        self.kernels.launch(kernel, blocks, self._threads, shared_bytes, arguments)
 
     def forget(self) -> None:
-        self.forgotten = True
+        self.kernels.forget()
 
 
 class EmulatedDevice:
@@ -73,10 +64,8 @@ class EmulatedDevice:
         self._folder, self._change, self._flags = folder, change, flags
 
     def load(self, sizes: Sizes) -> EmulatedProgram:
-        text = self._change(sizes.text())
-        program = EmulatedProgram(compiled(text, self._folder, self._flags), self.order)
-        program.new = self.new
-        return program
+        library = compiled(self._change(sizes.text()), self._folder, self._flags)
+        return EmulatedProgram(EmulatedKernels(library, self.order, new=self.new), sizes.threads)
 
 
 class HeldTable(ArrayTable):
@@ -85,35 +74,3 @@ class HeldTable(ArrayTable):
     def frame(self, node: int) -> SparseFrame:
         held = self.values[node].any(axis=-1)
         return SparseFrame.of(held, self.values[node][held])
-
-
-def compiled(text: str, folder: Path, flags: Sequence[str] = ()) -> Path:
-    """The library of some kernels' text, from `folder` where it was compiled before."""
-    name = f"kernels_{abs(hash((text, tuple(flags)))):x}"
-    library = folder / f"{name}.so"
-    if not library.exists():
-        source = folder / f"{name}.cu"
-        source.write_text(text)
-        kernels = re.findall(r'extern "C" __global__.*?(\w+)\(\n', text)
-        subprocess.run(
-            [
-                "g++",
-                "-std=c++17",
-                "-O1",
-                "-shared",
-                "-fPIC",
-                "-Wall",
-                "-Wno-unknown-pragmas",
-                "-Wno-unused-function",
-                "-Wno-unused-variable",
-                "-U_FORTIFY_SOURCE",
-                f'-DKERNELS="{source}"',
-                f"-DFHASH_KERNELS={','.join(f'FHASH_KERNEL({name})' for name in kernels)}",
-                *flags,
-                str(HERE / "emulated.cpp"),
-                "-o",
-                str(library),
-            ],
-            check=True,
-        )
-    return library

@@ -42,7 +42,7 @@ def trial(library_folder):
     return run
 
 
-@pytest.mark.parametrize("kernels", ["bricks", "points"])
+@pytest.mark.parametrize("kernels", ["bricks", "between", "points"])
 def test_kernels_stay_within_their_arrays(trial, kernels) -> None:
     done = trial(kernels, "2")
     assert done.stdout.strip() == "done", done.stderr[-3000:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from readable_paper import FHash
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.cuda.nvrtc import Unavailable
+from fhash_codec.devices import same_bits
 from fhash_codec.paper.engines.fused import program as driver
 from fhash_codec.paper.engines.fused.engine import (
     STATE,
@@ -26,14 +28,15 @@ from fhash_codec.paper.engines.fused.engine import (
     PointSizes,
     architecture_of,
     point_sizes,
-    start_fused,
     start_points,
 )
 from fhash_codec.paper.engines.parameters import LIBRARIES, needed_bytes
 from fhash_codec.paper.model import PointSampler, PointTables
-from fhash_codec.paper.network import Architecture, ArrayTable
+from fhash_codec.paper.network import ArrayTable
 from fhash_formats.errors import FhashWarning, InputError
 
+ORDERS = (0, 1, 5)
+"""Orders of the threads: upwards, downwards, shuffled."""
 CASES = [
     pytest.param((3, 7, 9, 20), {"hidden_layers": 1}, id="one hidden layer"),
     pytest.param((2, 9, 9, 13), {"hidden_layers": 2, "width": 20}, id="two, of an odd width"),
@@ -47,6 +50,24 @@ CASES = [
     pytest.param((2, 1, 1, 1), {"hidden_layers": 1}, id="one voxel, no coarse level"),
     pytest.param(
         (3, 20, 24, 40), {"hidden_layers": 1, "low": 0.9998}, id="a few vertices far apart"
+    ),
+    pytest.param(
+        (6, 7, 9, 17), {"hidden_layers": 1, "keys": (0, 3, 5)}, id="steps between key frames"
+    ),
+    pytest.param(
+        (4, 20, 24, 40),
+        {"embedding_size": 3, "keys": (0, 3), "low": 0.9998},
+        id="few vertices between key frames, two hidden layers",
+    ),
+    pytest.param(
+        (7, 5, 9, 4),
+        {"embedding_size": 1, "fold": 3, "keys": (0, 2, 6), "times": (3, 5, 1)},
+        id="levels of more times than there are key frames, and of one",
+    ),
+    pytest.param(
+        (3, 9, 9, 5),
+        {"hidden_layers": 0, "keys": (0, 2), "times": (2,)},
+        id="one step between key frames, one level",
     ),
 ]
 
@@ -68,17 +89,18 @@ def parts(parameters):
 
 @pytest.mark.parametrize(("shape", "settings"), CASES)
 def test_kernels_train_and_evaluate_as_the_oracle_does(engines_of, shape, settings) -> None:
-    coreset, fused, _, oracle = engines_of(shape, settings, order=3)
+    coreset, fused, native, oracle = engines_of(shape, settings, order=3)
     every = np.arange(len(coreset.bricks))
     np.testing.assert_allclose(fused.infer(every), oracle.infer(every), atol=2e-7)
     random = np.random.default_rng(1)
     for _ in range(15):
         chosen = random.permutation(len(every))[: max(1, len(every) // 3)]
-        error = float(fused.train(chosen))
-        assert error == pytest.approx(float(oracle.train(chosen)), rel=1e-3, abs=1e-6)
+        errors = [float(engine.train(chosen)) for engine in (fused, native, oracle)]
+        assert errors[:2] == pytest.approx(errors[2:] * 2, rel=1e-3, abs=1e-6)
     unsettled = fused.infer(every[::-1].copy())
     assert_close([unsettled], [oracle.infer(every[::-1].copy())], 0.01)
-    assert_close(parts(fused.parameters()), parts(oracle.parameters()), 0.01)
+    for other in (native, oracle):
+        assert_close(parts(fused.parameters()), parts(other.parameters()), 0.01)
     settled = fused.infer(every[::-1].copy())
     np.testing.assert_allclose(settled, unsettled, atol=1e-6)
 
@@ -100,19 +122,30 @@ def trained(fused, coreset, steps: int = 3) -> list[np.ndarray]:
     return [np.array(errors), values, *(getattr(fused, name).numpy() for name in STATE)]
 
 
-def test_the_order_of_the_threads_changes_nothing(engines_of) -> None:
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize(("shape", "keys"), [((2, 9, 9, 13), ()), ((4, 9, 9, 13), (0, 3))])
+def test_the_order_of_the_threads_changes_nothing(engines_of, shape, keys, deterministic) -> None:
     results = []
-    for order in (0, 1, 5):
-        coreset, fused, _, _ = engines_of((2, 9, 9, 13), {"hidden_layers": 2}, order=order)
-        results.append(trained(fused, coreset))
+    with same_bits("cuda", deterministic):
+        for order in ORDERS:
+            coreset, fused, _, _ = engines_of(
+                shape, {"hidden_layers": 2, "keys": keys}, order=order
+            )
+            results.append(trained(fused, coreset))
+    assert ("sum_entries" in fused._program.launched) == deterministic
     for other in results[1:]:
         for ours, theirs in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_each_engine_goes_on_with_the_other_ones_state(engines_of) -> None:
-    coreset, fused, native, _ = engines_of((3, 9, 10, 20), {"hidden_layers": 1})
-    _, straight, _, _ = engines_of((3, 9, 10, 20), {"hidden_layers": 1})
+BETWEEN = (6, 7, 9, 17), {"hidden_layers": 1, "keys": (0, 3, 5)}
+"""Shape and settings of a training with steps between key frames."""
+
+
+@pytest.mark.parametrize(("shape", "settings"), [((3, 9, 10, 20), {"hidden_layers": 1}), BETWEEN])
+def test_each_engine_goes_on_with_the_other_ones_state(engines_of, shape, settings) -> None:
+    coreset, fused, native, _ = engines_of(shape, settings)
+    _, straight, _, _ = engines_of(shape, settings)
     batches = np.random.default_rng(0).integers(0, len(coreset.bricks), (18, 1))
     for number, batch in enumerate(batches):
         straight.train(batch)
@@ -125,12 +158,33 @@ def test_each_engine_goes_on_with_the_other_ones_state(engines_of) -> None:
         np.testing.assert_allclose(ours[name], array, atol=1e-4, err_msg=name)
 
 
-@pytest.mark.parametrize("faulty", [False, True])
-def test_new_kernels_are_tried_first(engines_of, faulty) -> None:
-    shape, settings = (3, 9, 10, 20), {"hidden_layers": 1}
-    if faulty:
+def test_a_further_round_catches_up_at_its_own_rates(engines_of) -> None:
+    coreset, fused, _, oracle = engines_of((3, 9, 10, 20), {"hidden_layers": 1}, steps=4)
+    every = np.arange(len(coreset.bricks))
+    for engine in (fused, oracle):
+        for _ in range(4):
+            engine.train(every)
+        engine.rates = np.append(engine.rates, np.full(6, 0.1))
+        for _ in range(6):
+            engine.train(every[:1])
+    fine = fused.parameters().fine, oracle.parameters().fine
+    np.testing.assert_allclose(*fine, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("shape", "settings", "old", "new"),
+    [
+        ((3, 9, 10, 20), {"hidden_layers": 1}, "", ""),
+        ((3, 9, 10, 20), {"hidden_layers": 1}, "0.999f", "0.9f"),
+        (*BETWEEN, "", ""),
+        (*BETWEEN, "weight * model.flat[second]", "model.flat[second]"),
+    ],
+    ids=["as they are", "a wrong step", "between key frames", "a wrong weight there"],
+)
+def test_new_kernels_are_tried_first(engines_of, shape, settings, old, new) -> None:
+    if old:
         with pytest.raises(Unavailable, match="other results than native"):
-            engines_of(shape, settings, new=True, change=lambda t: t.replace("0.999f", "0.9f"))
+            engines_of(shape, settings, new=True, change=lambda t: t.replace(old, new))
         return
     coreset, fused, native, _ = engines_of(shape, settings, new=True)
     assert fused._program.launched
@@ -143,8 +197,6 @@ def test_new_kernels_are_tried_first(engines_of, faulty) -> None:
 
 
 CPU = torch.device("cpu")
-ORDERS = (0, 1, 5)
-"""Orders of the threads: upwards, downwards, shuffled."""
 KEY = 0.37
 """Share of the time of a series."""
 LAYERS = [(16, 0), (16, 1), (16, 2), (64, 1), (64, 2), (128, 1), (128, 2)]
@@ -366,32 +418,79 @@ def encoded_on_cuda(tmp_path, monkeypatch, emulated):
         monkeypatch.setattr(FusedEngine, "__init__", on_cpu)
         monkeypatch.setattr(driver, "CudaDevice", make)
         values = np.add.outer(
-            np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9))
+            np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 17))
         ).astype(np.float32)
-        config = EncodeConfig(
-            preset="published", epochs=3, width=8, device="cuda", tables="float16", **changes
-        )
+        usual = {"epochs": 3, "width": 8, "device": "cuda", "tables": "float16"}
+        config = EncodeConfig(preset="published", **usual | changes)
         with pretended_cuda():
             figures = fhash_codec.encode(values, tmp_path / "a.fhz", config)
         with fhash_codec.open(tmp_path / "a.fhz") as volume:
             assert np.isfinite(volume[:]).any()
-        return figures
+            return figures | volume.info["training"]
 
     return encode
 
 
-def test_a_series_is_encoded_on_the_device(encoded_on_cuda) -> None:
-    assert encoded_on_cuda()["device"] == "cuda"
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"key_frames": "0,2"},
+        {"tables": "transform"},
+        {"tables": "auto", "psnr": 12.5, "epochs": 0},
+        {"device": "auto", "engine": "fused"},
+    ],
+    ids=str,
+)
+def test_a_series_is_encoded_on_the_device(encoded_on_cuda, monkeypatch, changes) -> None:
+    for module in ("train", "fit"):
+        monkeypatch.setattr(f"fhash_codec.paper.{module}.usual_epochs", lambda _: 3)
+    figures = encoded_on_cuda(**changes)
+    assert (figures["device"], figures["engine"]) == ("cuda", "fused")
+    # A promise takes further rounds.
+    assert (figures["epochs"] > 3) == ("psnr" in changes)
 
 
-def test_the_cpu_trains_what_the_kernels_cannot_and_says_so(encoded_on_cuda) -> None:
-    with pytest.warns(FhashWarning, match="the CPU trains, since .*: samples between key frames"):
-        figures = encoded_on_cuda(key_frames="0,2")
-    assert figures["device"] == "cpu"
+def without_nvrtc(device):
+    """Stand in for a device where kernels cannot be compiled."""
+    raise Unavailable("no NVRTC was found here\nand so on")
 
 
-def test_a_training_needs_what_is_said(engines_of) -> None:
-    coreset, fused, _, _ = engines_of((3, 20, 24, 40), {"hidden_layers": 2})
+@pytest.mark.parametrize(
+    ("changes", "limits", "reason"),
+    [
+        ({"embedding_size": 16, "fold": 2}, {}, r"has 80 inputs, and kernels .* do 64 at most"),
+        ({"brick": "6x7x9"}, {"shared_per_block": 1 << 12}, "a brick of 6 x 7 x 9 .* more shared"),
+        ({}, None, "no NVRTC was found here"),
+    ],
+)
+def test_what_cuda_cannot_do_is_refused_or_left_to_the_cpu(
+    encoded_on_cuda, emulated, monkeypatch, changes, limits, reason
+) -> None:
+    def make(device):
+        return without_nvrtc(device) if limits is None else emulated(**limits)
+
+    monkeypatch.setattr("fhash_codec.devices.CUDA_PAYS", 0.0)
+    for named in ({}, {"device": "auto", "engine": "fused"}):
+        with pytest.raises(InputError, match=rf"{reason}.*; use .*--device cpu$") as error:
+            encoded_on_cuda(make, **changes | named)
+        assert "\n" not in str(error.value)
+    figures = encoded_on_cuda(make, device="auto", **changes)
+    assert (figures["device"], figures["engine"]) == ("cpu", "native")
+    (why,) = [stage["why"] for stage in figures["stages"] if stage["stage"] == "engine"]
+    assert re.search(f"on the CPU, as .*{reason}", why)
+
+
+def test_an_engine_that_is_named_is_taken_without_cuda(encoded_on_cuda, monkeypatch) -> None:
+    monkeypatch.setattr("fhash_codec.devices.CUDA_PAYS", 0.0)
+    assert encoded_on_cuda(device="auto", engine="native")["device"] == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("shape", "settings"), [((3, 20, 24, 40), {}), ((4, 20, 24, 40), {"keys": (0, 3)})]
+)
+def test_a_training_needs_what_is_said(engines_of, shape, settings) -> None:
+    coreset, fused, _, _ = engines_of(shape, settings)
     every = [each for each in vars(fused).values() if isinstance(each, torch.Tensor)]
     every += [each for each in fused._arrays.values() if each is not None]
     held = sum(each.nbytes for each in every)
@@ -402,57 +501,6 @@ class Cuda:
     """A device that claims to be CUDA; tensors are made on the CPU."""
 
     type = "cuda"
-
-
-@pytest.fixture
-def start(noise_coreset, monkeypatch):
-    """A function of a device and of whether the engine is required: what was started."""
-    coreset = noise_coreset((2, 5, 9, 13))
-    architecture = Architecture.for_box(coreset.box.shape, 2, width=8)
-
-    def make(device, required=False):
-        return start_fused(
-            architecture, coreset, np.full(9, 0.01), seed=0, device=device, required=required
-        )
-
-    return make
-
-
-def test_a_processor_has_no_fused_engine(start) -> None:
-    assert start("cpu") is None
-    with pytest.raises(InputError, match="needs a CUDA device, but the device is 'cpu'"):
-        start("cpu", required=True)
-
-
-def test_a_failure_is_one_warning_or_an_error_if_the_engine_is_required(start, monkeypatch) -> None:
-    def fail(device):
-        raise Unavailable("a reason of this test")
-
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(driver, "CudaDevice", fail)
-    with pytest.warns(FhashWarning, match="the CPU trains, since .* had: a reason of this test"):
-        assert start("cuda") is None
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert start("cuda") is None
-    with pytest.raises(InputError, match="'fused' cannot be had: a reason of this test"):
-        start("cuda", required=True)
-
-
-def test_the_engine_is_started_on_the_device(start, monkeypatch, emulated) -> None:
-    """An emulated device stands in for CUDA, and torch's device is the CPU all the same."""
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(driver, "CudaDevice", lambda device: emulated())
-
-    original = FusedEngine.__init__
-
-    def on_cpu(self, *arguments, device, **settings):
-        original(self, *arguments, device=torch.device("cpu"), **settings)
-
-    monkeypatch.setattr(FusedEngine, "__init__", on_cpu)
-    engine = start("cuda", required=True)
-    assert isinstance(engine, FusedEngine)
-    assert float(engine.train(np.array([0]))) > 0
 
 
 def test_points_that_the_kernels_cannot_do_are_left_to_torch_with_one_warning(

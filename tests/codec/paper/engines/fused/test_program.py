@@ -22,21 +22,38 @@ from fhash_codec.paper.engines.fused.program import (
     kernel_sizes,
     missed_step_tables,
 )
-from fhash_codec.paper.engines.parameters import EPSILON, WINDOW, axis_matrices, catch_up
+from fhash_codec.paper.engines.parameters import (
+    EPSILON,
+    WINDOW,
+    axis_matrices,
+    catch_up,
+    weights_at,
+)
 from fhash_codec.paper.network import Architecture
 
 
-@pytest.mark.parametrize("shape", [(3, 9, 20, 35), (1, 1, 33, 2), (2, 5, 1, 1), (5, 16, 8, 64)])
-def test_corners_and_weights_are_those_of_the_matrices(noise_coreset, shape) -> None:
-    coreset = noise_coreset(shape)
-    architecture = Architecture.for_box(coreset.box.shape, shape[0])
+@pytest.mark.parametrize(
+    ("shape", "keys"),
+    [
+        ((3, 9, 20, 35), ()),
+        ((1, 1, 33, 2), ()),
+        ((2, 5, 1, 1), ()),
+        ((5, 16, 8, 64), ()),
+        ((7, 9, 20, 35), (0, 1, 4, 6)),
+    ],
+)
+def test_corners_and_weights_are_those_of_the_matrices(noise_coreset, shape, keys) -> None:
+    coreset = noise_coreset(shape, keys=keys, fringe=bool(keys))
+    architecture = Architecture.for_box(coreset.box.shape, len(coreset.key_frames))
     lengths, counts = (1, *coreset.brick_shape), (shape[0], *coreset.brick_grid)
     axes = axis_tables(architecture, coreset)
     for number, (axis, length, count) in enumerate(zip(axes, lengths, counts, strict=True)):
-        for level, resolution in enumerate(architecture.levels[1:]):
-            start, expected = axis_matrices(
-                architecture.sizes[number], resolution[number], length, count
-            )
+        for level, resolution in enumerate(architecture.levels[not keys :]):
+            size, corners = architecture.sizes[number], resolution[number]
+            start, expected = axis_matrices(size, corners, length, count)
+            if number == 0:
+                places = coreset.key_places[:, None] * (corners - 1) / max(size - 1, 1)
+                start, expected = weights_at(places, corners)
             before, after = axis.before[:, level], axis.after[:, level]
             assert axis.corners[level] == expected.shape[2]
             np.testing.assert_array_equal(axis.start[:, level], start)
@@ -95,22 +112,34 @@ def nvrtc_nvrtc() -> Nvrtc:
 
 @pytest.fixture
 def sizes_of(noise_coreset):
-    """A function of an architecture and of settings of the model: the sizes."""
-    coreset = noise_coreset((4, 21, 48, 60))
+    """A function of an architecture, key frames and settings of the model: the sizes."""
 
-    def make(architecture, **settings):
-        model = Architecture.for_box(coreset.box.shape, 4, **settings)
+    def make(architecture, keys, **settings):
+        coreset = noise_coreset((4, 21, 48, 60), keys=keys, fringe=bool(keys))
+        keys = len(coreset.key_frames)
+        model = Architecture.for_box(coreset.box.shape, keys, **settings)
         return kernel_sizes(model, coreset, DEVICES[architecture])[0]
 
     return make
 
 
 @pytest.mark.parametrize("architecture", DEVICES)
-@pytest.mark.parametrize(("width", "layers", "size"), [(64, 1, 2), (64, 2, 2), (128, 2, 2)])
+@pytest.mark.parametrize(
+    ("width", "layers", "size", "keys"),
+    [
+        (64, 1, 2, ()),
+        (64, 2, 2, ()),
+        (128, 2, 2, ()),
+        (64, 2, 2, (0, 3)),
+        (128, 2, 2, (0, 3)),
+        (16, 2, 1, (0, 3)),
+    ],
+)
 def test_kernels_need_few_registers_and_no_local_memory(
-    nvrtc_nvrtc, sizes_of, architecture, width, layers, size
+    nvrtc_nvrtc, sizes_of, architecture, width, layers, size, keys
 ) -> None:
-    sizes = sizes_of(architecture, width=width, hidden_layers=layers, embedding_size=size)
+    """With key frames, the finest level is interpolated, too."""
+    sizes = sizes_of(architecture, keys, width=width, hidden_layers=layers, embedding_size=size)
     assert assert_few_resources(nvrtc_nvrtc, sizes, architecture) == {
         "train_bricks",
         "infer_bricks",
@@ -163,20 +192,31 @@ H100 = DeviceLimits(
 )
 
 
+L40 = DeviceLimits(
+    multiprocessors=142, shared_per_block=99 << 10, shared_per_multiprocessor=100 << 10
+)
+BETWEEN = {"shape": (3, 16, 16, 32), "keys": (0, 2)}
+"""Samples between key frames: the finest level is interpolated, too."""
+
+
 @pytest.fixture
 def sizes_of_source(noise_coreset):
     """A function of limits and of settings of the model: the sizes."""
 
-    def make(limits=H100, shape=(2, 16, 16, 32), **settings):
-        coreset = noise_coreset(shape)
-        architecture = Architecture.for_box(coreset.box.shape, shape[0], **settings)
+    def make(limits=H100, shape=(2, 16, 16, 32), keys=(), **settings):
+        coreset = noise_coreset(shape, keys=keys, fringe=bool(keys))
+        keys = len(coreset.key_frames)
+        architecture = Architecture.for_box(coreset.box.shape, keys, **settings)
         return kernel_sizes(architecture, coreset, limits)[0]
 
     return make
 
 
-def test_tiles_are_as_large_as_two_blocks_of_a_multiprocessor_allow(sizes_of_source) -> None:
-    sizes = [sizes_of_source(width=64, hidden_layers=layers) for layers in (0, 1, 2)]
+@pytest.mark.parametrize("changes", [{}, BETWEEN], ids=["stored", "interpolated"])
+def test_tiles_are_as_large_as_two_blocks_of_a_multiprocessor_allow(
+    sizes_of_source, changes
+) -> None:
+    sizes = [sizes_of_source(hidden_layers=layers, **changes) for layers in (0, 1, 2)]
     assert [size.columns for size in sizes] == [128, 128, 64]
     for size in sizes:
         assert 2 * size.shared_bytes <= H100.shared_per_multiprocessor
@@ -191,6 +231,7 @@ def test_tiles_are_as_large_as_two_blocks_of_a_multiprocessor_allow(sizes_of_sou
         ({"embedding_size": 16}, "inputs"),
         ({"limits": replace(H100, shared_per_block=1 << 12)}, "more shared memory"),
         ({"shape": (1, 1, 1, 1000)}, "more shared memory"),
+        ({"limits": L40, "embedding_size": 4, **BETWEEN}, "more shared memory"),
     ],
 )
 def test_what_the_kernels_cannot_do_is_said(sizes_of_source, settings, message) -> None:
