@@ -24,9 +24,6 @@ ACCESS = {"default": "balanced", "small": "small", "fast": "fast", PUBLISHED: "b
 PRESETS = tuple(ACCESS)
 """Every preset, the default first."""
 
-ENGINES = ("fused", "native")
-"""Training engines of the published network, the fastest first; `fused` is for CUDA alone."""
-
 SAMPLES = ("all", "keys", "published")
 """Samples that the published network trains on."""
 
@@ -224,9 +221,6 @@ class EncodeConfig(Record):
         "given",
         choices=TABLES,
         published=True,
-    )
-    engine: str = limits(
-        "auto", "published: training engine", choices=("auto", *ENGINES), published=True
     )
     device: str = limits(
         "auto",

@@ -187,7 +187,7 @@ def training_device(
     """
     pays = f"the CPU takes about {cpu_seconds:.1f} s, and CUDA pays from {CUDA_PAYS:g} s on"
     if name == "cpu":
-        return "cpu", "on the CPU, as --device says, or --engine"
+        return "cpu", "on the CPU, as --device says"
     if name == "auto":
         if not may_have_cuda():
             return "cpu", "on the CPU, as there is no CUDA device, or no torch"
@@ -204,7 +204,7 @@ def training_device(
 
     free, _ = torch.cuda.mem_get_info(device)
     if needed_bytes <= free:
-        return "cuda", f"on CUDA, as {pays if name == 'auto' else '--device says, or --engine'}"
+        return "cuda", f"on CUDA, as {pays if name == 'auto' else '--device says'}"
     lack = (
         f"training needs about {needed_bytes / 2**30:.1f} GiB on the CUDA device,"
         f" of which {free / 2**30:.1f} GiB are free"

@@ -14,7 +14,7 @@ import torch
 from fhash_codec.devices import computing_threads
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.native import network as native
-from fhash_codec.paper.engines import Engine, make_engine
+from fhash_codec.paper.engines import ENGINES, Engine, make_engine
 from fhash_codec.paper.engines.native import NativeEngine
 from fhash_codec.paper.network import Architecture
 from fhash_codec.paper.train import Probe, TrainingPlan
@@ -232,7 +232,7 @@ class Variant:
         """Return a new engine; arguments as in `make_engine`."""
         if self.path is not None:
             return NativeEngine(architecture, coreset, rates, seed=seed, path=self.path)
-        return make_engine(self.engine, architecture, coreset, rates, seed=seed, device=device.type)
+        return make_engine(architecture, coreset, rates, seed=seed, device=ENGINES[self.engine])
 
 
 @dataclass

@@ -18,7 +18,7 @@ import torch
 from fhash_bench.engines import GOALS, EngineFigures, EngineRun, Peak, Peaks, Variant, now
 from fhash_bench.rate.generated import DEFAULT, is_made, made_series
 from fhash_codec.boxes import Box, Sizes
-from fhash_codec.config import ENGINES, EncodeConfig
+from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.report import require_matplotlib
 from fhash_codec.devices import choose_device, machine, threads_for
 from fhash_codec.features.bricks import Coreset
@@ -26,6 +26,7 @@ from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.encode import select
+from fhash_codec.paper.engines import ENGINES
 from fhash_codec.paper.engines.native import refusal
 from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import Architecture, ArrayTable, Layer, Network
@@ -338,7 +339,7 @@ def _variants(
     unknown = sorted(set(engines) - set(ENGINES))
     if unknown:
         raise InputError(f"unknown engine '{unknown[0]}'; known: {', '.join(ENGINES)}")
-    reason = refusal(architecture, device.type)
+    reason = refusal(architecture)
     if reason is not None and "native" in engines:
         raise InputError(f"the engine 'native' does not take this model: {reason}")
     variants = []

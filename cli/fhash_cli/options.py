@@ -265,11 +265,11 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Preset": ("preset", "effort", "train", "tile", "without"),
     "Preset published": (
         "key-frames", "samples", "fold", "embedding-size", "hidden-layers", "width", "epochs",
-        "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables", "engine",
+        "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables",
         "engines",
     ),
     "Scene": (
-        "scene", "steps", "paper-shape", "gallery", "set", "effect", "size", "background",
+        "scene", "steps", "gallery", "set", "effect", "size", "background",
         "antialiasing", "scale",
     ),
     "Camera": (

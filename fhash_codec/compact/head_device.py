@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from functools import cache, partial
 from pathlib import Path
 
@@ -52,7 +53,8 @@ def learner_on(device: str) -> Callable[[Batches], Learn]:
 def device_learner(device: Device, voxels: Batches) -> Learn:
     """Return what learns from some batches by the kernels of a device.
 
-    The host queues two launches for each update, and waits once for all.
+    The host queues two launches for each update, and waits once for all. The first updates of new
+    kernels are done by the CPU, too, and compared.
     """
     with _needed():
         kernels = device.load(KERNELS.read_text(encoding="utf-8"), options=EACH_ROUNDED)
@@ -66,7 +68,10 @@ def device_learner(device: Device, voxels: Batches) -> Learn:
         return device.memory(24 * number), device.memory(16 * number)
 
     def learn(network: Network, first: int, rates: Double, roots: Double, rounded: bool) -> None:
-        number = len(network.parameters)
+        number, expected = len(network.parameters), None
+        if kernels.new:
+            expected = deepcopy(network)
+            native_learner(voxels)(expected, first, rates, roots, rounded)
         numbers = np.stack([network.parameters, network.means, network.squares])
         state, sums = held(number)
         state.send(numbers)
@@ -86,6 +91,11 @@ def device_learner(device: Device, voxels: Batches) -> Learn:
             kernels.launch("head_step", parts, THREADS, norm_bytes, step)
         state.receive(numbers)
         network.parameters[:], network.means[:], network.squares[:] = numbers
+        if expected is not None:
+            ours = expected.parameters, expected.means, expected.squares
+            if not all(map(np.array_equal, numbers, ours)):
+                raise Unavailable("its kernels have trained another MLP than the CPU")
+            kernels.keep()
 
     return _needed()(learn)
 

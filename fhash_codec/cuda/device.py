@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.cuda.declarations import ffi
-from fhash_codec.cuda.nvrtc import Unavailable, cache_folder, compiled, loaded
+from fhash_codec.cuda.nvrtc import Unavailable, cache_folder, compiled, kept, loaded
 
 LIBRARIES = ("libcuda.so.1", "nvcuda.dll")
 """Names of the driver's library."""
@@ -56,7 +56,7 @@ class Kernels(Protocol):
     """Kernels that a device has loaded.
 
     Attributes:
-        new: whether they were compiled just now, and never ran here before.
+        new: whether they never did well here before: `keep` says that they do.
     """
 
     new: bool
@@ -75,8 +75,8 @@ class Kernels(Protocol):
         arguments: pointers to them.
         """
 
-    def forget(self) -> None:
-        """Remove the kernels from the cache."""
+    def keep(self) -> None:
+        """Put new kernels into the cache, after a trial."""
 
 
 class Device(Protocol):
@@ -99,6 +99,9 @@ class Device(Protocol):
 
     def free(self) -> int:
         """Bytes that are free."""
+
+    def wait(self) -> None:
+        """Wait until all kernels have ended; Unavailable where one failed."""
 
     def load(
         self, text: str, headers: Mapping[str, str] | None = None, options: Sequence[str] = ()
@@ -127,6 +130,12 @@ class Driver:
             reason = ffi.string(text[0]).decode() if text[0] else f"error {answer}"
             kind = MemoryError if answer == OUT_OF_MEMORY else Unavailable
             raise kind(f"{name} of the CUDA driver failed: {reason}")
+
+    def version(self) -> int:
+        """The major version of CUDA that the driver has."""
+        version = ffi.new("int *")
+        self.call("cuDriverGetVersion", version)
+        return int(version[0]) // 1000
 
     def count(self) -> int:
         """The number of devices."""
@@ -170,17 +179,19 @@ class CudaMemory:
 
     def __del__(self) -> None:
         if hasattr(self, "address") and not sys.is_finalizing():
-            self._device.call("cuMemFree_v2", self.address)
+            # Behind a kernel that failed, every call does.
+            with suppress(Unavailable, MemoryError):
+                self._device.call("cuMemFree_v2", self.address)
 
 
 class CudaKernels:
     """`Kernels` of a CUDA device."""
 
-    def __init__(self, device: CudaDevice, cubin: bytes, cached: Path | None) -> None:
-        """Load a module; `cached` is its file, if it is new."""
-        self._device, self._cached, self.new = device, cached, cached is not None
+    def __init__(self, device: CudaDevice, cubin: bytes, file: Path, *, new: bool) -> None:
+        """Load a module; `file` is that of the cache."""
+        self._device, self._cubin, self._file, self.new = device, cubin, file, new
         self._module = ffi.new("CUmodule *")
-        self._kernels: dict[tuple[str, int], Any] = {}
+        self._kernels: dict[str, tuple[Any, int]] = {}
         device.call("cuModuleLoadData", self._module, cubin)
 
     def launch(
@@ -201,19 +212,22 @@ class CudaKernels:
             ffi.NULL,
         )
 
-    def forget(self) -> None:
-        if self._cached is not None:
-            self._cached.unlink(missing_ok=True)
+    def keep(self) -> None:
+        if self.new:
+            kept(self._cubin, self._file)
+            self.new = False
 
     def _kernel(self, name: str, shared_bytes: int) -> Any:
         """A kernel that may have some bytes of shared memory."""
-        kernel = self._kernels.get((name, shared_bytes))
-        if kernel is None:
-            found, call = ffi.new("CUfunction *"), self._device.call
+        call = self._device.call
+        if name not in self._kernels:
+            found = ffi.new("CUfunction *")
             call("cuModuleGetFunction", found, self._module[0], name.encode())
-            kernel = found[0]
+            self._kernels[name] = found[0], -1
+        kernel, most = self._kernels[name]
+        if shared_bytes > most:
             call("cuFuncSetAttribute", kernel, DYNAMIC_SHARED, shared_bytes)
-            self._kernels[name, shared_bytes] = kernel
+            self._kernels[name] = kernel, shared_bytes
         return kernel
 
 
@@ -230,6 +244,7 @@ class CudaDevice:
         self.name = ffi.string(name).decode(errors="replace")
         self._context = ffi.new("CUcontext *")
         self._driver.call("cuDevicePrimaryCtxRetain", self._context, index)
+        self._loaded: dict[tuple[str, ...], CudaKernels] = {}
         of = self._driver.attribute
         self._architecture = 10 * of(index, CAPABILITY_MAJOR) + of(index, CAPABILITY_MINOR)
         self.multiprocessors = of(index, MULTIPROCESSORS)
@@ -252,22 +267,34 @@ class CudaDevice:
     def load(
         self, text: str, headers: Mapping[str, str] | None = None, options: Sequence[str] = ()
     ) -> CudaKernels:
-        def loaded_from(*, anew: bool) -> CudaKernels:
-            cubin, file = compiled(
-                text,
-                self._architecture,
-                cache_folder(),
-                headers=headers,
-                options=options,
-                anew=anew,
-            )
-            return CudaKernels(self, cubin, file)
+        key = text, *(headers or {}).values(), *options
+        if key not in self._loaded:
+            self._loaded[key] = self._load(text, headers, options, anew=False)
+        return self._loaded[key]
 
+    def _load(
+        self, text: str, headers: Mapping[str, str] | None, options: Sequence[str], *, anew: bool
+    ) -> CudaKernels:
+        cubin, file, new = compiled(
+            text,
+            self._architecture,
+            cache_folder(),
+            headers=headers,
+            options=options,
+            anew=anew,
+            newest=self._driver.version(),
+        )
         try:
-            return loaded_from(anew=False)
+            return CudaKernels(self, cubin, file, new=new)
         except Unavailable:
-            # A file in the cache that is damaged; what was compiled just now fails once more.
-            return loaded_from(anew=True)
+            if new:
+                raise
+        # The file in the cache is damaged.
+        return self._load(text, headers, options, anew=True)
+
+    def wait(self) -> None:
+        """Wait until all kernels have ended; Unavailable where one failed."""
+        self.call("cuCtxSynchronize")
 
     @contextmanager
     def _current(self) -> Iterator[None]:

@@ -19,6 +19,7 @@ typedef struct CUmod_st* CUmodule;
 typedef struct CUfunc_st* CUfunction;
 typedef struct CUstream_st* CUstream;
 int cuInit(unsigned flags);
+int cuDriverGetVersion(int* version);
 int cuGetErrorString(int result, const char** text);
 int cuDeviceGetAttribute(int* value, int attribute, int device);
 int cuModuleLoadData(CUmodule* module, const void* image);

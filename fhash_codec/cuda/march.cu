@@ -46,12 +46,14 @@ float network_at(const FhashInput&, double, double, double, float*) { return NON
 #include "march_network.cuh"
 #endif
 
-// Draw the pictures of `march`. counters, added to: as those of `fhash_march`.
+// Draw the warps from first to before stop into the pictures of `march`, in rows of warps.
+// counters, added to: as those of `fhash_march`.
 extern "C" __global__ void __launch_bounds__(FHASH_THREADS) march_pixels(
-    const __grid_constant__ FhashInput march, unsigned long long* counters) {
-    const long long across = (march.width + 7) / 8, down = (march.height + 3) / 4;
-    const long long warp = (blockIdx.x * (long long)FHASH_THREADS + threadIdx.x) / 32;
-    if (warp >= across * down) return;
+    const __grid_constant__ FhashInput march, unsigned long long* counters, long long first,
+    long long stop) {
+    const long long across = (march.width + 7) / 8;
+    const long long warp = first + (blockIdx.x * (long long)FHASH_THREADS + threadIdx.x) / 32;
+    if (warp >= stop) return;
     const int lane = threadIdx.x % 32;
     const long long x = warp % across * 8 + lane % 8, y = warp / across * 4 + lane / 8;
     if (x < march.width && y < march.height) {

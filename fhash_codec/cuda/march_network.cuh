@@ -118,7 +118,7 @@ float by_layers(const float* numbers, const float (&inputs)[INPUTS], float* slop
 }
 
 // The normalised value at a place of the box; slopes: by t, z, y and x per vertex, t left out.
-float network_at(const FhashInput& m, double x, double y, double z, float* slopes) {
+FHASH_APART float network_at(const FhashInput& m, double x, double y, double z, float* slopes) {
     float inputs[INPUTS], by_input[INPUTS];
     each_input(m, x, y, z, [&](int input, const Level&, const Places&, float value,
                                const float (&)[3]) { inputs[input] = value; });

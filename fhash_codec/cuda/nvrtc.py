@@ -121,14 +121,21 @@ class Nvrtc:
         return str(ffi.string(self._library.nvrtcGetErrorString(answer)).decode())
 
 
-def find_nvrtc() -> Nvrtc:
-    """Return the first NVRTC that loads; Unavailable where there is none."""
+def find_nvrtc(newest: int | None = None) -> Nvrtc:
+    """Return the first NVRTC that loads; Unavailable where there is none.
+
+    newest: its largest major version: a driver of an older one does not load what it compiles.
+    """
     failures = []
     for path in _candidates():
         try:
-            return Nvrtc(path)
+            found = Nvrtc(path)
         except OSError as error:
             failures.append(f"{path}: {error}")
+            continue
+        if newest is None or found.version[0] <= newest:
+            return found
+        failures.append(f"{path} is of CUDA {found.version[0]}, and the driver of CUDA {newest}")
     reason = "; ".join(failures) or "pip install nvidia-cuda-nvrtc, or a CUDA build of torch"
     raise Unavailable(f"no NVRTC was found here: {reason}")
 
@@ -168,20 +175,21 @@ def compiled(
     headers: Mapping[str, str] | None = None,
     options: Sequence[str] = (),
     anew: bool = False,
-) -> tuple[bytes, Path | None]:
+    newest: int | None = None,
+) -> tuple[bytes, Path, bool]:
     """Return machine code for a text, from the cache where it was compiled before.
 
-    What the cache has is found without NVRTC, which takes time to load. Where the cache cannot be
-    read or written, each process compiles.
+    What the cache has is found without NVRTC, which takes time to load.
 
     Args:
         text, headers, options: as in `Nvrtc.compile`.
         architecture: of the device, as in 90 for sm_90.
         folder: the cache.
         anew: whether to compile even if the cache has the machine code.
+        newest: major version of CUDA that the driver has; None for any.
 
     Returns:
-        The machine code, and its file in the cache if it was compiled just now.
+        The machine code, its file in the cache, which `kept` writes, and whether it is new.
 
     Raises:
         Unavailable: there is no NVRTC, it does not know the architecture, or the text is wrong.
@@ -191,22 +199,26 @@ def compiled(
     file = folder / f"{digest[:32]}-sm_{architecture}.cubin"
     if not anew:
         try:
-            return file.read_bytes(), None
+            return file.read_bytes(), file, False
         except OSError:
             pass
-    nvrtc = find_nvrtc()
+    nvrtc = find_nvrtc(newest)
     # Machine code runs on later devices of the same generation.
     known = [number for number in nvrtc.architectures if number <= architecture]
     if not known or max(known) // 10 != architecture // 10 or architecture < LOWEST:
         raise Unavailable(f"NVRTC {nvrtc.path} cannot compile for sm_{architecture}")
     cubin, _ = nvrtc.compile(text, max(known), headers, options)
+    return cubin, file, True
+
+
+def kept(cubin: bytes, file: Path) -> None:
+    """Write machine code into the cache; where it cannot be written, each process compiles."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file, force=True) as temporary:
             temporary.write_bytes(cubin)
     except (OSError, FhashError):
         pass
-    return cubin, file
 
 
 def cache_folder() -> Path:

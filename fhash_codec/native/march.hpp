@@ -120,7 +120,7 @@ inline FhashCell network_cell(const FhashInput& m, double x, double y, double z,
 }
 
 // The trilinear value at a place, clamped to the vertices, and its gradient per vertex. A vertex of
-// no weight need not have a value; where it has none, the gradient has none (NaN). values: (z, y, x)
+// no weight need not have a value; where it has none, the gradient has none (NaN). values: z, y, x
 // of a shape.
 inline FhashCell trilinear(const float* values, const std::int64_t* shape, double x, double y,
                            double z) {

@@ -105,7 +105,7 @@ void Packet::sample_network(Counters& counted, Seen& seen) {
     for (int l = 0; l < N; l++) {
         counted.samples += on[l];
         const int j = k[l] - begun[l];
-        const bool known = value[l] == value[l] && on[l];
+        const bool known = on[l] && value[l] == value[l] && (held[l] >> j & 1);
         const float here = value[l] = known ? ahead[l][j] : NONE;
         seen.lost |= on[l] && !known;
         if (flags & MAXIMUM) {

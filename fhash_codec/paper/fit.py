@@ -274,9 +274,6 @@ class _Fitting:
         self._progress, self._goal = progress, goal
         self._limited, self._threads = False, 1
         self._psnr: float | None = None
-        # An engine that is named says where to train, too.
-        of_engine = {"fused": "cuda", "native": "cpu"}.get(config.engine, "auto")
-        self._wanted = of_engine if config.device == "auto" else config.device
         self._device = self._choose_device()
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
@@ -389,7 +386,7 @@ class _Fitting:
         batches = usual_batches(samples, bricks, self._config.batch)
         epochs = self._config.epochs or usual_epochs(batches)
         device, why = training_device(
-            self._wanted,
+            self._config.device,
             cpu_seconds(self._architecture, samples * epochs),
             needed_bytes(self._architecture, self._coreset),
             refusal(self._architecture),
@@ -400,13 +397,12 @@ class _Fitting:
     def _engine(self, plan: TrainingPlan) -> Engine:
         """Return a new engine, in the state of the checkpoint if there is one."""
         engine = make_engine(
-            self._config.engine,
             self._architecture,
             self._coreset,
             plan.rates,
             seed=self._config.seed,
             # CUDA that nobody named gives way to the CPU where its kernels cannot be had.
-            device="cpu" if self._device == "cpu" else self._wanted,
+            device="cpu" if self._device == "cpu" else self._config.device,
         )
         if self._saved_state is not None:
             try:

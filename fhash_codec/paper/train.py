@@ -425,7 +425,7 @@ MAX_NAME_BYTES = 250
 """Bytes of a checkpoint's file name, with those that a temporary name adds; systems allow 255."""
 PARTIAL_BYTES = 24
 """Bytes that a temporary name adds while the checkpoint is written."""
-UNRELATED = ("device", "engine", "psnr", "tables", "timings", "train_on_seconds", "without")
+UNRELATED = ("device", "psnr", "tables", "timings", "train_on_seconds", "without")
 """Settings that do not change the course of a training, but at most its rounding and its end.
 
 Engines go on from each other's state.

@@ -294,7 +294,9 @@ def march_native(
     else:
         network = None if frame.network is None else frame.network.device
         counters = _counted(
-            device.march(everything, _flags(task), fetching=fetching, network=network)
+            device.march(
+                everything, _flags(task), fetching=fetching, network=network, progress=progress
+            )
         )
     if fetching is not None and fetching.error is not None:
         raise fetching.error
@@ -455,7 +457,7 @@ def _march(
 
 
 def _flags(task: Task) -> int:
-    """What is drawn, as flags of `fhash_march`."""
+    """The flags of `fhash_march` for what is drawn."""
     if task.projection:
         return PROJECTIONS[task.projection]
     graded = (SHADED | GRADED) * (task.grading is not None)

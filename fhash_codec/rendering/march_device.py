@@ -7,10 +7,10 @@ many as fit.
 
 from __future__ import annotations
 
-import math
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.native import ffi
 from fhash_codec.paper.engines import fused
 from fhash_codec.paper.network import Network
+from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.march_task import Marched
 from fhash_codec.rendering.network_device import (
     NetworkNodes,
@@ -32,7 +33,7 @@ from fhash_codec.rendering.network_device import (
     rows_of,
     spans_of,
 )
-from fhash_codec.rendering.tiled_frame import Fetching, TiledFrame
+from fhash_codec.rendering.tiled_frame import Fetching
 from fhash_formats.support.values import Mask
 
 SOURCES = Path(native.__file__).parent
@@ -60,6 +61,10 @@ TRIAL_ERROR = 5e-4
 """Difference of pictures, in colours and opacity up to 1, that is no more than rounding."""
 TRIAL_RARE = 1e-3
 """Share of a picture in which rounding may decide on more: a surface that a ray touches or not."""
+SAMPLES = 1 << 28
+"""Samples of a launch, about; through a network an eighth. A slow device takes less than a second:
+one with a display ends what takes two.
+"""
 FREE = 0.75
 """Share of the memory that is free at the start that frames may take."""
 
@@ -95,8 +100,24 @@ def _is_there(field: Any) -> bool:
     return field is not None and (not isinstance(field, int | float) or bool(field))
 
 
-Kept = tuple[npt.NDArray[Any], Memory, Mask | None]
-"""An array, its copy on the device, and the blocks that were decoded when it was made."""
+@dataclass(kw_only=True, eq=False)
+class _Copy:
+    """A copy of an array on the device.
+
+    Attributes:
+        of: the array, as long as it is.
+        memory: of the copy.
+        decoded: blocks that were decoded when it was made, of a frame that is decoded bit by bit.
+    """
+
+    of: weakref.ref[npt.NDArray[Any]]
+    memory: Memory
+    size: int
+    decoded: Mask | None = None
+
+
+class UntriedError(Exception):
+    """The kernels never did well here before, and are to be tried first (`DeviceMarcher.trial`)."""
 
 
 class DeviceMarcher:
@@ -104,17 +125,15 @@ class DeviceMarcher:
 
     Attributes:
         device: the device.
-        new: whether the kernels of the last picture never ran here before.
     """
 
     def __init__(self, device: Device, threads: int = THREADS) -> None:
         """Take over a device; threads: of a block, whole warps."""
         self.device, self._threads = device, threads
         self._limit = int(FREE * device.free())
-        self._last: Kernels | None = None
-        self._kept: OrderedDict[int, Kept] = OrderedDict()
-        self._programs: dict[str, Kernels] = {}
+        self._kept: OrderedDict[int, _Copy] = OrderedDict()
         self._nodes: tuple[Callable[[], Network | None], NetworkNodes] | None = None
+        self._trying: list[Kernels] | None = None
 
     def network(self, network: Network, key: float) -> DeviceNetwork:
         """A network at one time on the device; Unavailable for one that the kernels cannot do."""
@@ -131,27 +150,34 @@ class DeviceMarcher:
         if self._nodes is not None and self._nodes[0] is network:
             self._nodes = None
 
-    @property
-    def new(self) -> bool:
-        return self._last is not None and self._last.new
-
-    def judge(self, ours: Marched, theirs: Marched) -> None:
-        """Compare a picture by the last kernels with the CPU's; Unavailable if they differ."""
-        assert self._last is not None
-        apart = float(np.quantile(np.abs(ours.rgba - theirs.rgba), 1 - TRIAL_RARE))
+    def trial(self, draw: Callable[[], Marched], expected: Marched) -> None:
+        """Draw a picture by kernels that are new; Unavailable where another one is expected."""
+        self._trying = []
+        try:
+            ours = draw()
+            tried = self._trying
+        finally:
+            self._trying = None
+        apart = float(np.quantile(np.abs(ours.rgba - expected.rgba), 1 - TRIAL_RARE))
         if not apart <= TRIAL_ERROR:
-            self._last.forget()
             raise Unavailable(f"its kernels drew another picture than the CPU, {apart:.2g} apart")
-        self._last.new = False
+        for kernels in tried:
+            kernels.keep()
 
     def kernels(
         self, flags: int, fields: Mapping[str, Any], network: Mapping[str, int] | None = None
     ) -> Kernels:
-        """The kernels for an input; Unavailable where they cannot be had."""
+        """The kernels for an input; Unavailable where they cannot be had.
+
+        Raises UntriedError for new ones, but in a trial.
+        """
         text = kernel_text(flags, fields, network, self._threads)
-        if text not in self._programs:
-            self._programs[text] = self.device.load(text, headers(), OPTIONS)
-        return self._programs[text]
+        kernels = self.device.load(text, headers(), OPTIONS)
+        if self._trying is not None:
+            self._trying.append(kernels)
+        elif kernels.new:
+            raise UntriedError
+        return kernels
 
     def march(
         self,
@@ -160,92 +186,121 @@ class DeviceMarcher:
         *,
         fetching: Fetching | None = None,
         network: DeviceNetwork | None = None,
+        progress: Progress = silent,
     ) -> npt.NDArray[np.int64]:
         """Draw into the pictures of an input (`FhashMarch`, by name); the counters.
 
         fetching: decodes what rays come to; None where all is there.
         network: that the rays march through, if they do.
+        progress: is told of the parts of the picture that are done.
 
         Raises:
             Unavailable: the kernels cannot be had.
             MemoryError: the device has too little memory.
+            UntriedError: as in `kernels`.
         """
         constants = None if network is None else network.constants
-        self._last = kernels = self.kernels(flags, fields, constants)
+        kernels = self.kernels(flags, fields, constants)
         if network is not None:
             fields = {**fields, **network.fields(kernels)}
-        while True:
-            counters, missing = self._launched(kernels, fields, fetching)
-            if fetching is None or not missing.any():
-                return counters
-            # Rays ended where something was missing: the picture is drawn anew with it.
-            fetching.fetch(np.flatnonzero(missing))
-            if fetching.error is not None:
-                return counters
-
-    def _launched(
-        self, kernels: Kernels, fields: Mapping[str, Any], fetching: Fetching | None
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
-        """Draw once; the counters, and by brick whether something of it was missing."""
         pictures = {name: fields[name] for name in PICTURES if fields[name] is not None}
-        made = {name: self._made(array.nbytes) for name, array in pictures.items()}
-        held: dict[str, Memory] = dict(made)
-        for name, array in fields.items():
-            if isinstance(array, np.ndarray) and _is_pointer(name) and name not in made:
-                # What is fetched while it is marched changes.
-                keep = name in KEPT and (fetching is None or name not in fetching.fields)
-                tiles = fetching.tiles if fetching is not None and name == "values" else None
-                held[name] = self._sent(array, tiles, keep=keep)
-        counters = sent(self.device, np.zeros(6, np.int64))
-        missing = np.zeros(0 if fetching is None else fields["ready"].size, np.int32)
-        if fetching is not None:
-            held["fetch"] = sent(self.device, missing)
-        given = {
-            name: _addressed(name, held[name].address if name in held else field)
-            for name, field in fields.items()
-            if field is not None
-        }
-        warps = math.prod(-(-int(fields[name]) // side) for name, side in TILE.items())
-        kernels.launch(
-            "march_pixels",
-            -(-warps * 32 // self._threads),
-            self._threads,
-            0,
-            [ffi.new("FhashMarch *", given), ffi.new("uint64_t *", counters.address)],
-        )
-        for name, memory in made.items():
-            memory.receive(pictures[name])
-        counted = np.empty(6, np.int64)
-        counters.receive(counted)
-        if fetching is not None:
-            held["fetch"].receive(missing)
-        return counted, missing
+        held = {name: self._made(array.nbytes) for name, array in pictures.items()}
+        sent_at: dict[str, _Copy] = {}
+        parts = _bands(fields, network is not None)
+        while True:
+            for name, array in fields.items():
+                if isinstance(array, np.ndarray) and _is_pointer(name) and name not in pictures:
+                    held[name] = self._sent(name, array, fetching, sent_at)
+            counters = sent(self.device, np.zeros(6, np.int64))
+            missing = np.zeros(0 if fetching is None else fields["ready"].size, np.int32)
+            if fetching is not None:
+                held["fetch"] = sent(self.device, missing)
+            addresses = {name: memory.address for name, memory in held.items()}
+            given = {
+                name: _addressed(name, addresses.get(name, field))
+                for name, field in fields.items()
+                if field is not None
+            }
+            self._launch(kernels, ffi.new("FhashMarch *", given), counters, parts, progress)
+            if fetching is not None:
+                held["fetch"].receive(missing)
+                if missing.any():
+                    # Rays ended where something was missing: the picture is drawn anew with it.
+                    fetching.fetch(np.flatnonzero(missing))
+                    if fetching.error is None:
+                        continue
+            for name, array in pictures.items():
+                held[name].receive(array)
+            counted = np.empty(6, np.int64)
+            counters.receive(counted)
+            return counted
 
-    def _sent(self, array: npt.NDArray[Any], tiles: TiledFrame | None, *, keep: bool) -> Memory:
-        """A copy of an array on the device, kept from an earlier picture if it may be.
+    def _launch(
+        self,
+        kernels: Kernels,
+        march: Any,
+        counters: Memory,
+        parts: list[tuple[int, int]],
+        progress: Progress,
+    ) -> None:
+        """Draw part by part: a display's device, and Ctrl-C, wait for the end of each."""
+        at = ffi.new("uint64_t *", counters.address)
+        for number, (first, stop) in enumerate(parts):
+            progress("marching", number, len(parts), "")
+            ends = ffi.new("int64_t *", first), ffi.new("int64_t *", stop)
+            blocks = -(-(stop - first) * 32 // self._threads)
+            kernels.launch("march_pixels", blocks, self._threads, 0, [march, at, *ends])
+            self.device.wait()
 
-        tiles: the frame whose values these are, where it is decoded as it is marched.
+    def _sent(
+        self,
+        name: str,
+        array: npt.NDArray[Any],
+        fetching: Fetching | None,
+        before: dict[str, _Copy],
+    ) -> Memory:
+        """A copy of an array on the device: one that was made before, if it may be.
+
+        before: copies that this picture has sent already, by name.
         """
-        decoded = None if tiles is None else tiles.decoded.copy()
-        kept = self._kept.pop(id(array), None)
-        if kept is None:
-            memory = self._made(array.nbytes)
-            memory.send(array)
-        else:
-            _, memory, before = kept
-            if tiles is not None and before is not None:
-                for first, stop in tiles.layers(tiles.decoded & ~before):
-                    memory.send(array[first:stop], offset=first * array.strides[0])
-            elif before is not None and not before.all():
-                memory.send(array)  # all is decoded by now
-        if keep:
-            self._kept[id(array)] = array, memory, decoded
-        return memory
+        changes = fetching is not None and name in fetching.fields
+        decoded = None
+        if fetching is not None and name in ("values", "smooth"):
+            decoded = fetching.tiles.decoded.copy()
+        copy = before.get(name)
+        if copy is None and name in KEPT and not changes:
+            copy = self._kept.pop(id(array), None)
+        if copy is None:
+            copy = _Copy(
+                of=weakref.ref(array, self._dropped(id(array))),
+                memory=self._made(array.nbytes),
+                size=array.nbytes,
+            )
+            copy.memory.send(array)
+        elif fetching is not None and copy.decoded is not None and decoded is not None:
+            reach = fetching.reach if name == "smooth" else 0
+            for first, stop in fetching.tiles.layers(decoded & ~copy.decoded):
+                layers = slice(max(first - reach, 0), stop + reach)
+                copy.memory.send(array[layers], offset=layers.start * array.strides[0])
+        elif changes or (copy.decoded is not None and not copy.decoded.all()):
+            copy.memory.send(array)
+        copy.decoded, before[name] = decoded, copy
+        if name in KEPT and not changes:
+            self._kept[id(array)] = copy
+        return copy.memory
+
+    def _dropped(self, key: int) -> Callable[[Any], None]:
+        """A function that forgets a copy when its array is gone."""
+
+        def forget(_: Any) -> None:
+            self._kept.pop(key, None)
+
+        return forget
 
     def _made(self, size: int) -> Memory:
         """Memory of the device, for which the arrays leave that were used least recently."""
         while True:
-            held = sum(array.nbytes for array, *_ in self._kept.values())
+            held = sum(copy.size for copy in list(self._kept.values()))
             try:
                 if not self._kept or held + size <= self._limit:
                     return self.device.memory(size)
@@ -253,6 +308,16 @@ class DeviceMarcher:
                 if not self._kept:
                     raise
             self._kept.popitem(last=False)
+
+
+def _bands(fields: Mapping[str, Any], network: bool) -> list[tuple[int, int]]:
+    """Warps of a picture in parts, (first, stop), each of about SAMPLES samples at most."""
+    across, down = (-(-int(fields[name]) // side) for name, side in TILE.items())
+    box, spacing = np.asarray(fields["box"]), np.abs(np.asarray(fields["spacing"]))
+    longest = float(np.linalg.norm((box[:, 1] - box[:, 0]) * spacing)) / float(fields["step"])
+    most = SAMPLES / (32 * int(fields["rays"]) ** 2 * max(longest, 1.0) * (8 if network else 1))
+    each, warps = max(1, int(min(most, across * down))), across * down
+    return [(first, min(first + each, warps)) for first in range(0, warps, each)]
 
 
 class DeviceNetwork:

@@ -738,8 +738,6 @@ def _device(volume: Volume, scene: Scene, task: Task, pictures: int) -> tuple[st
     if asked == "cpu":
         return "cpu", "as the scene says"
     check_cuda(asked, torch=False)
-    if not has_device():
-        return "cpu", "there is no CUDA device"
     if asked == "cuda":
         return "cuda", "as the scene says"
     grid = task.rays.grid
@@ -750,7 +748,10 @@ def _device(volume: Volume, scene: Scene, task: Task, pictures: int) -> tuple[st
     seconds = samples / rate
     many = "" if pictures == 1 else f" for {pictures} pictures"
     cost = f"the CPU needs about {seconds:.2g} s{many}, and CUDA takes {CUDA_START:g} s to start"
-    return ("cuda" if seconds > CUDA_START else "cpu"), cost
+    if seconds <= CUDA_START:
+        return "cpu", cost
+    # To ask the driver takes time, too, and keeps CUDA from processes that are forked later.
+    return ("cuda", cost) if has_device() else ("cpu", "there is no CUDA device")
 
 
 def arrays_of(scene: Scene) -> Arrays:

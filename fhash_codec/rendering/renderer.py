@@ -20,11 +20,12 @@ from fhash_codec.cuda.device import first_device
 from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
+from fhash_codec.rendering.grid import Warp
 from fhash_codec.rendering.image import Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.march_device import DeviceMarcher
+from fhash_codec.rendering.march_device import DeviceMarcher, UntriedError
 from fhash_codec.rendering.march_task import Frame, Marched, Task, complete
 from fhash_codec.rendering.network_frame import network_frame
 from fhash_codec.rendering.plan import Plan, arrays_of, plan_at, plan_picture
@@ -205,6 +206,7 @@ class Renderer:
         self._last_plan: tuple[Scene, Plan] | None = None
         self._marcher: DeviceMarcher | None = None
         self._refused = False
+        self._of_network: tuple[float, Frame, Bricks] | None = None
         self._fullest: tuple[Any, int] | None = None
         self._background: ThreadPoolExecutor | None = None
         self._prefetch: tuple[Key, Future[TiledFrame]] | None = None
@@ -294,7 +296,7 @@ class Renderer:
             chosen = only_features(self._whole, features) if features else self._whole
             self.volume, self._features = chosen, features
             self._frames.clear()
-            self._histogram = self._last_plan = None
+            self._histogram = self._last_plan = self._of_network = None
 
     def histogram(self) -> Histogram:
         """Count the values of the series: its first, middle and last step, coarse if possible."""
@@ -329,7 +331,7 @@ class Renderer:
             return self._drawn(
                 plan,
                 task,
-                lambda marcher: network_frame(self.volume, plan.step, plan.units, warp, marcher),
+                lambda marcher: self._network_frame(plan, warp, marcher),
                 progress,
             )
         field: Field = NetworkField(self.volume, plan.step, plan.units, arrays_of(plan.scene))
@@ -342,6 +344,18 @@ class Renderer:
             budget=plan.scene.march.samples_per_pass,
             progress=progress,
         )
+
+    def _network_frame(
+        self, plan: Plan, warp: Warp | None, marcher: DeviceMarcher | None
+    ) -> tuple[Frame, Bricks]:
+        """The frame of the network at a plan's step; that of a device is kept for the next."""
+        if marcher is None:
+            return network_frame(self.volume, plan.step, plan.units, warp, None)
+        if self._of_network is None or self._of_network[0] != plan.step:
+            self._of_network = None  # both may not fit
+            found = network_frame(self.volume, plan.step, plan.units, warp, marcher)
+            self._of_network = plan.step, *found
+        return self._of_network[1:]
 
     def _drawn(self, plan: Plan, task: Task, source: Source, progress: Progress) -> Marched:
         """March on the plan's device, kernels that never ran here before after a trial.
@@ -361,12 +375,13 @@ class Renderer:
         try:
             if self._marcher is None:
                 self._marcher = DeviceMarcher(first_device())
-            marched = by(self._marcher)
-            if self._marcher.new:
+            try:
+                return by(self._marcher)
+            except UntriedError:
                 rays = replace(task.rays, size=TRIAL_SIZE)
                 small = replace(task, rays=rays, antialiasing=1)
-                self._marcher.judge(by(self._marcher, small), by(None, small))
-            return marched
+                self._marcher.trial(lambda: by(self._marcher, small), by(None, small))
+                return by(self._marcher)
         except (Unavailable, MemoryError) as error:
             reason = f"the CUDA device cannot draw this: {error}"
             if plan.scene.march.device == "cuda":

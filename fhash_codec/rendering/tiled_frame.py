@@ -270,6 +270,7 @@ class Fetching:
 
     Attributes:
         tiles: the frame.
+        reach: vertices around a block that smoothed values depend on it in.
         fields: of `FhashMarch`, by name.
         error: what a block failed by, None if none did.
     """
@@ -293,6 +294,7 @@ class Fetching:
             smoothing: deviation and largest error of the values that shade, None for the frame's.
         """
         self.tiles, self._task, self._by, self._smoothing = tiles, task, by, smoothing
+        self.reach = margin
         shape = tiles.bricks.low.shape
         self._first, self._last = zip(
             *(_blocks_of(starts, n, margin) for starts, n in zip(tiles.starts, shape, strict=True)),
@@ -320,7 +322,7 @@ class Fetching:
             for blocks in product(*map(_reached, self._first, self._last, places)):
                 wanted[blocks] = True
             list(in_threads(self.tiles.decode, list(zip(*np.nonzero(wanted), strict=True))))
-            self._update([(0, n) for n in self._ready.shape])
+            self._update([(0, n) for n in self.tiles.bricks.low.shape])
         except BaseException as error:  # it is raised again where the march ends
             self.error = error
 

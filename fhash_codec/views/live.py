@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl
 from fhash_codec.rendering.cameras import usual_size
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.renderer import Renderer
-from fhash_codec.rendering.scenes import USUAL_EFFECTS, Camera, Marching, Scene
+from fhash_codec.rendering.scenes import USUAL_EFFECTS, Camera, Scene
 from fhash_codec.views.server import Answer
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, suggestion
@@ -50,14 +50,14 @@ class Live:
     volume, and the first column of the colour bar; `ms` of drawing; `device`; `samples`.
     """
 
-    def __init__(self, volume: Volume, *, device: str = "auto") -> None:
-        """Plan the default picture; raises what planning raises, such as for a missing device.
+    def __init__(self, volume: Volume) -> None:
+        """Plan the default picture; raises what planning raises.
 
-        volume: an open container that nobody else reads until `close`. device: as of a scene.
+        volume: an open container that nobody else reads until `close`.
         """
         self._renderer = Renderer(volume, pictures=PICTURES)
         size = usual_size(Camera(), Grid.of_volume(volume))
-        scene = Scene(effects=USUAL_EFFECTS, size=size, march=Marching(device=device))
+        scene = Scene(effects=USUAL_EFFECTS, size=size)
         self._scene = self._renderer.plan(scene).scene
         facts = {"name": file_name(volume.path), "size": size, "last": volume.shape[0] - 1}
         text = json.dumps({**facts, "step": self._scene.step or 0}).replace("<", "\\u003c")

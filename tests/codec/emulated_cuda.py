@@ -75,13 +75,13 @@ class EmulatedKernels:
 
     Attributes:
         launched: names of the kernels that were launched.
-        forgotten: whether they were to be removed from the cache.
+        kept: whether they were to be put into the cache.
     """
 
     def __init__(self, library: Path, order: int, *, new: bool = False) -> None:
         self._library, self._order, self.new = FFI.dlopen(str(library)), order, new
         self.launched: list[str] = []
-        self.forgotten = False
+        self.kept = False
 
     def launch(
         self,
@@ -98,8 +98,8 @@ class EmulatedKernels:
         if answer:
             raise Unavailable(f"{kernel}: {FAILURES[answer]}")
 
-    def forget(self) -> None:
-        self.forgotten = True
+    def keep(self) -> None:
+        self.kept, self.new = True, False
 
 
 class EmulatedDevice:
@@ -131,6 +131,7 @@ class EmulatedDevice:
             pytest.skip("g++ compiles the emulated kernels, and is not here")
         self._folder, self._order, self._new = folder, order, new
         self._change, self._flags = change, flags
+        self._loaded: dict[Path, EmulatedKernels] = {}
 
     def memory(self, size: int) -> EmulatedMemory:
         return EmulatedMemory(size)
@@ -138,12 +139,17 @@ class EmulatedDevice:
     def free(self) -> int:
         return 1 << 30
 
+    def wait(self) -> None:
+        pass
+
     def load(
         self, text: str, headers: Mapping[str, str] | None = None, options: Sequence[str] = ()
     ) -> EmulatedKernels:
         flags = (*self._flags, *(OF_NVRTC[each] for each in options if each in OF_NVRTC))
         library = compiled(self._change(text), self._folder, flags, headers)
-        return EmulatedKernels(library, self._order, new=self._new)
+        if library not in self._loaded:
+            self._loaded[library] = EmulatedKernels(library, self._order, new=self._new)
+        return self._loaded[library]
 
 
 def compiled(

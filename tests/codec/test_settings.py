@@ -69,7 +69,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native"),
+        ({"device": "warp"}, "device is 'warp'; allowed: auto, cpu, cuda"),
         (
             {"preset": "published", "ratio": 9.0},
             "ratio is not for --preset published",
@@ -98,7 +98,6 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
                 "schedule": "constant",
                 "batch": 64,
                 "tables": "uint8",
-                "engine": "native",
             }.items()
         ),
         (
@@ -169,7 +168,7 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch) -> None:
 def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     assert not has_torch()
-    with pytest.raises(MissingDependencyError, match=r"a test needs torch: .*fhash\[cuda"):
+    with pytest.raises(MissingDependencyError, match=r"a test needs torch: .*fhash\[torch"):
         need_torch("a test")
     for name in ("auto", "cpu", "cuda"):
         with pytest.raises(MissingDependencyError, match=f"device '{name}' needs torch"):

@@ -295,9 +295,7 @@ def oracle(run: Run) -> Iterator[Result]:
         ]
         tables = torch.cat([table.grad.flatten() for table in list(naive.model.tables)[1:]])
         for name in run.engines:
-            make = partial(
-                make_engine, name, model, coreset, rates, seed=1, device=run.device_of(name)
-            )
+            make = partial(make_engine, model, coreset, rates, seed=1, device=run.device_of(name))
             result: Result = {"engine": name, "model": f"{width}x{layers}"}
             try:
                 engine: Any = make()
@@ -372,7 +370,7 @@ def measured(run: Run, name: str, feature: str, width: int, layers: int) -> Resu
     try:
         begun = time.perf_counter()
         rates, device = np.full(1 << 18, 0.001), run.device_of(name)
-        engine = make_engine(name, architecture, coreset, rates, seed=0, device=device)
+        engine = make_engine(architecture, coreset, rates, seed=0, device=device)
         run.wait()
         result["start_s"] = time.perf_counter() - begun
         for batch in run.batches:
@@ -417,9 +415,7 @@ def curve(run: Run) -> Iterator[Result]:
         result: Result = {"engine": name, "model": f"{width}x{layers}"}
         try:
             begun, model = time.perf_counter(), architecture_of(coreset, width, layers)
-            engine = make_engine(
-                name, model, coreset, plan.rates, seed=0, device=run.device_of(name)
-            )
+            engine = make_engine(model, coreset, plan.rates, seed=0, device=run.device_of(name))
             ready, reached = time.perf_counter() - begun, TrainingProgress()
             with threads_for(plan.batch_samples):
                 train(engine, plan, coreset, reached, Breaks(budget_seconds=run.curve_seconds))

@@ -132,7 +132,8 @@ def test_variables_files_that_grew_and_parts_decode_to_their_values(
 )
 def test_settings_of_goldens_say_the_preset(name: str, preset: str) -> None:
     with fhash_codec.open(HERE / f"{name}.fhz") as volume:
-        assert fhash_codec.EncodeConfig.from_dict(volume.config).preset == preset
+        settings = {name: value for name, value in volume.config.items() if name != "engine"}
+        assert fhash_codec.EncodeConfig.from_dict(settings).preset == preset  # "engine" is gone
         assert (f" --preset {preset}" in history_line(volume.container.header)) == (
             preset != "default"
         )

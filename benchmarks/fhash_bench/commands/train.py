@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def _engines_named(text: str) -> tuple[str, ...]:
-    from fhash_codec.config import ENGINES
+    from fhash_codec.paper.engines import ENGINES
 
     names = tuple(name.strip() for name in text.split(","))
     for name in names:

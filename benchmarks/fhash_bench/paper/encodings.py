@@ -529,9 +529,7 @@ class LatticeModel:
         self.tables = parameter_count(architecture.levels, EMBEDDING_SIZE)
         self.mlp = architecture.parameters - self.tables
         self.architecture = architecture
-        self.engine = make_engine(
-            "auto", architecture, coreset, rates, seed=seed, device=device.type
-        )
+        self.engine = make_engine(architecture, coreset, rates, seed=seed, device=device.type)
         self.places = torch.from_numpy(sample_places(coreset))
         self._dense: list[Tensor] | None = None
 

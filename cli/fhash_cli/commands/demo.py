@@ -53,12 +53,18 @@ OVERHEAD_BYTES = 2**20
 """Bytes of a file beside its values: header, coordinates, indices of chunks."""
 
 
+PAPER: dict[str, int] = {}
+"""The shape of the paper's data."""
+
+
 def _shape(text: str) -> dict[str, int]:
     from fhash_formats.readers.file_series import parse_shape
 
     words = [word.strip() for word in text.split(",")]
     if len(words) == 3 and all(word.isascii() and word.isdecimal() for word in words):
         return dict(zip("zyx", map(int, words), strict=True))
+    if text == "paper":
+        return PAPER
     shape: dict[str, int] = {}
     with contextlib.suppress(ValueError):
         shape = parse_shape(text)
@@ -67,7 +73,7 @@ def _shape(text: str) -> dict[str, int]:
     return shape
 
 
-SHAPE = TextType("Z,Y,X", _shape)
+SHAPE = TextType("Z,Y,X|paper", _shape)
 """Vertices along z, y and x as `Z,Y,X`, or by name as `x=64,y=64,z=32`, with `t` for steps."""
 
 
@@ -78,7 +84,6 @@ class SceneOptions:
     scene: str
     shape: dict[str, int] | None
     steps: int | None
-    paper_shape: bool
     seed: int
 
     @property
@@ -89,7 +94,7 @@ class SceneOptions:
     @property
     def given(self) -> list[str]:
         """Names of the options that change a scene's own settings."""
-        return [name for name in ("shape", "steps", "paper_shape", "seed") if getattr(self, name)]
+        return [name for name in ("shape", "steps", "seed") if getattr(self, name)]
 
     def open(self) -> Simulation:
         """The simulation; raises InputError for an unsuitable scene or shape."""
@@ -97,16 +102,16 @@ class SceneOptions:
         from fhash_codec.simulation.simulate import Simulation
 
         steps, shape = self.steps, None
+        if self.shape == PAPER:
+            if steps is not None:
+                raise click.UsageError("--shape paper excludes --steps")
+            return Simulation(scene_of(self.scene).as_in_paper(), self.seed)
         if self.shape is not None:
             if "t" in self.shape and steps is not None:
                 raise click.UsageError("--shape t=... and --steps exclude each other")
             steps = self.shape.get("t", steps)
             shape = self.shape["z"], self.shape["y"], self.shape["x"]
-        if self.paper_shape and (shape is not None or steps is not None):
-            raise click.UsageError("--paper-shape excludes --shape and --steps")
-        scene = scene_of(self.scene)
-        scene = scene.as_in_paper() if self.paper_shape else scene.resized(shape, steps)
-        return Simulation(scene, self.seed)
+        return Simulation(scene_of(self.scene).resized(shape, steps), self.seed)
 
 
 scene_options = option_group(
@@ -123,7 +128,8 @@ scene_options = option_group(
     click.option(
         "--shape",
         type=SHAPE,
-        help="Vertices along z, y and x, such as 54,172,200 or x=200,y=172,z=54. Default: a small"
+        help="Vertices along z, y and x, such as 54,172,200 or x=200,y=172,z=54; paper for shape"
+        " and steps of the paper's data that flame, bubble or shell resembles. Default: a small"
         " shape of the scene's own.",
     ),
     click.option(
@@ -131,11 +137,6 @@ scene_options = option_group(
         type=click.IntRange(1),
         metavar="N",
         help="Number of steps. Default: a small number of the scene's own.",
-    ),
-    click.option(
-        "--paper-shape",
-        is_flag=True,
-        help="Shape and steps of the paper's data set that flame, bubble or shell resembles.",
     ),
     click.option(
         "--seed",

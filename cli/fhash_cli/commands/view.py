@@ -65,12 +65,10 @@ class Written(TypedDict):
     help="Write page and containers into DIR, for any web server, and serve nothing.",
 )
 @click.option("--no-browser", is_flag=True, help="Open no browser.")
-@click.option("--live", is_flag=True, help="Draw here, and send pictures instead of RUN.fhz.")
 @click.option(
-    "--device",
-    type=click.Choice(("auto", "cpu", "cuda")),
-    default="auto",
-    help="Where --live draws; auto: on a GPU if there is one.",
+    "--live",
+    is_flag=True,
+    help="Draw here, on a GPU if there is one, and send pictures instead of RUN.fhz.",
 )
 @variable_option
 @force_option
@@ -81,7 +79,6 @@ def view_command(
     folder: str | None,
     no_browser: bool,
     live: bool,
-    device: str,
     variable: str | None,
     force: bool,
     as_json: bool,
@@ -101,11 +98,11 @@ def view_command(
             raise click.UsageError("--live shows one RUN.fhz, without --static and --force")
         with (
             open_volume(runs[0], variable=variable) as volume,
-            closing(Live(volume, device=device)) as view,
+            closing(Live(volume)) as view,
         ):
             return _serve(view, [file_name(runs[0])], port, no_browser, as_json)
-    if device != "auto" or variable is not None:
-        raise click.UsageError("--device and --var are of --live: give --live too")
+    if variable is not None:
+        raise click.UsageError("--var is of --live: give --live too")
     page = Page(runs)
     if folder is not None:
         outputs = page.write(folder, force=force)

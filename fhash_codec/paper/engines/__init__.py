@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Protocol, SupportsFloat
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.config import ENGINES
 from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.devices import first_line, need_torch
 from fhash_codec.progress import tell
@@ -62,8 +61,11 @@ class Engine(Protocol):
         """Continue from a `state`; raises KeyError or ValueError for one of another model."""
 
 
+ENGINES = {"fused": "cuda", "native": "cpu"}
+"""Device of each engine, the fastest first."""
+
+
 def make_engine(
-    name: str,
     architecture: Architecture,
     coreset: Coreset,
     rates: npt.NDArray[np.float64],
@@ -71,10 +73,9 @@ def make_engine(
     seed: int,
     device: str,
 ) -> Engine:
-    """Return a new engine.
+    """Return a new engine: fused on CUDA, native on a CPU.
 
     Args:
-        name: fused, native, or auto for fused on CUDA and native on a CPU.
         architecture: the sizes of the model.
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
@@ -82,31 +83,22 @@ def make_engine(
         device: 'cpu' or 'cuda', where the engine computes, or 'auto' for CUDA unless the kernels
             cannot be had or cannot do the model, which the stage `engine` then says.
 
-    Raises:
-        InputError: the name is unknown, or the engine cannot be had or does not take the model.
+    Raises InputError where the engine cannot be had or does not take the model.
     """
-    if name == "fused" or (name == "auto" and device != "cpu"):
-        if device == "cpu":
-            raise InputError(
-                "engine is 'fused', which needs a CUDA device, but the device is 'cpu';"
-                " use --engine auto"
-            )
-        need_torch(f"device '{device}'" if name == "auto" else "engine 'fused'")
+    if device != "cpu":
+        need_torch(f"device '{device}'")
         from fhash_codec.paper.engines.fused.engine import start_fused
 
         try:
             return start_fused(architecture, coreset, rates, seed=seed)
         except Unavailable as error:
-            reason = f"engine 'fused' cannot be had: {first_line(error)}"
-            if name == "fused" or device == "cuda":
-                raise InputError(f"{reason}; use --engine auto --device cpu") from error
+            reason = f"kernels for CUDA cannot be had: {first_line(error)}"
+            if device == "cuda":
+                raise InputError(f"{reason}; use --device cpu") from error
         tell("engine", f"tables and network at their random start, on the CPU, as {reason}")
-        device = "cpu"
-    if name in ("auto", "native"):
-        from fhash_codec.paper.engines.native import NativeEngine
+    from fhash_codec.paper.engines.native import NativeEngine
 
-        return NativeEngine(architecture, coreset, rates, seed=seed, device=device)
-    raise InputError(f"unknown engine '{name}'; known: auto, {', '.join(ENGINES)}")
+    return NativeEngine(architecture, coreset, rates, seed=seed)
 
 
 def describe_engine(engine: Engine, threads: int) -> dict[str, str | int]:

@@ -181,10 +181,8 @@ def cpu_seconds(architecture: Architecture, samples: int) -> float:
     return samples * operations / rate
 
 
-def refusal(architecture: Architecture, device: str = "cpu") -> str | None:
+def refusal(architecture: Architecture) -> str | None:
     """Return why a model cannot be trained by the native engine here; None if it can."""
-    if device != "cpu":
-        return f"it computes on a CPU, and the device is '{device}'"
     if not machine_paths():
         return "the native library was built for none of this machine's instructions"
     if architecture.hidden_layers > MOST_HIDDEN:
@@ -216,7 +214,6 @@ class NativeEngine:
         rates: npt.NDArray[np.float64],
         *,
         seed: int,
-        device: str = "cpu",
         path: str = "auto",
     ) -> None:
         """Start from fresh parameters; arguments as in `make_engine`.
@@ -227,7 +224,7 @@ class NativeEngine:
         Raises:
             InputError: the engine does not take the model, or the machine lacks the instructions.
         """
-        reason = refusal(architecture, device)
+        reason = refusal(architecture)
         if reason is not None:
             raise InputError(f"the engine 'native' does not take this model: {reason}")
         if path not in ("auto", *machine_paths()):

@@ -185,8 +185,8 @@ def test_demo_makes_data_container_and_picture(fhash: Fhash, tmp_path: Path, sce
         (("--shape", "z=4,y=5,x=6,t=7", "--steps", "3"), "--steps exclude each other"),
         (("--steps", "0"), "--steps"),
         (("--seed", "-1"), "--seed"),
-        (("--paper-shape",), "flame, bubble, shell do"),
-        (("--paper-shape", "--scene", "shell", "--steps", "3"), "--paper-shape excludes"),
+        (("--shape", "paper"), "flame, bubble, shell do"),
+        (("--shape", "paper", "--scene", "shell", "--steps", "3"), "--shape paper excludes"),
         (("--gallery", "g", "--steps", "3"), "--steps is for a scene"),
     ],
 )

@@ -12,7 +12,7 @@ from fhash_codec.cuda import device as devices
 from fhash_codec.cuda import nvrtc as compilers
 from fhash_codec.cuda.declarations import ffi
 from fhash_codec.cuda.device import CudaDevice, CudaKernels, has_device, sent
-from fhash_codec.cuda.nvrtc import Unavailable, compiled, find_nvrtc
+from fhash_codec.cuda.nvrtc import Unavailable, compiled, find_nvrtc, kept
 
 
 class FakeNvrtc:
@@ -49,6 +49,8 @@ class FakeLibrary:
                 arguments[0][0] = arguments[1]
             if name == "cuDeviceGetCount":
                 arguments[0][0] = 1
+            if name == "cuDriverGetVersion":
+                arguments[0][0] = 13_000
             if name == "cuMemAlloc_v2":
                 arguments[0][0] = 4096 * (len(self.held) + 1)
                 self.held[arguments[0][0]] = bytearray(arguments[1])
@@ -67,7 +69,7 @@ class FakeLibrary:
 @pytest.fixture
 def nvrtc(monkeypatch) -> FakeNvrtc:
     found = FakeNvrtc()
-    monkeypatch.setattr(compilers, "find_nvrtc", lambda: found)
+    monkeypatch.setattr(compilers, "find_nvrtc", lambda newest: found)
     return found
 
 
@@ -86,24 +88,29 @@ def library_of(monkeypatch):
 
 
 def test_a_text_is_compiled_once_for_each_architecture(nvrtc, tmp_path) -> None:
-    code, file = compiled("a", 90, tmp_path / "cache")
-    assert code == b"code of a"
-    assert file is not None
-    assert file.read_bytes() == code
-    assert compiled("a", 90, tmp_path / "cache") == (code, None)
-    assert nvrtc.compiled == [90]
-    compiled("b", 90, tmp_path / "cache")
-    compiled("a", 80, tmp_path / "cache")
-    compiled("a", 90, tmp_path / "cache", headers={"h": "of another text"})
-    compiled("a", 90, tmp_path / "cache", options=["--fmad=false"])
-    assert nvrtc.compiled == [90, 90, 80, 90, 90]
-    assert len(list((tmp_path / "cache").iterdir())) == 5
+    """What was not kept after a trial is compiled again."""
+    folder = tmp_path / "cache"
+    code, file, new = compiled("a", 90, folder)
+    assert (code, new) == (b"code of a", True)
+    assert compiled("a", 90, folder) == (code, file, True)
+    kept(code, file)
+    assert compiled("a", 90, folder) == (code, file, False)
+    assert nvrtc.compiled == [90, 90]
+    others = [
+        compiled("b", 90, folder),
+        compiled("a", 80, folder),
+        compiled("a", 90, folder, headers={"h": "of another text"}),
+        compiled("a", 90, folder, options=["--fmad=false"]),
+    ]
+    assert nvrtc.compiled == [90, 90, 90, 80, 90, 90]
+    assert len({file, *(other[1] for other in others)}) == 5
 
 
 def test_what_the_cache_has_needs_no_compiler(nvrtc, tmp_path, monkeypatch) -> None:
-    compiled("a", 90, tmp_path)
-    monkeypatch.setattr(compilers, "find_nvrtc", lambda: 1 / 0)
-    assert compiled("a", 90, tmp_path) == (b"code of a", None)
+    code, file, _ = compiled("a", 90, tmp_path)
+    kept(code, file)
+    monkeypatch.setattr(compilers, "find_nvrtc", lambda newest: 1 / 0)
+    assert compiled("a", 90, tmp_path) == (code, file, False)
 
 
 @pytest.mark.parametrize(("architecture", "target"), [(89, 86), (90, 90), (100, 0), (61, 0)])
@@ -125,8 +132,7 @@ def test_a_damaged_file_of_the_cache_is_compiled_anew(
     monkeypatch.setattr(devices, "cache_folder", lambda: tmp_path)
     # The library's answers are the numbers that it is asked for: the architecture is 75 and 76.
     monkeypatch.setattr(FakeNvrtc, "architectures", (10 * 75 + 76,))
-    compiled("a", 10 * 75 + 76, tmp_path)
-    (file,) = tmp_path.iterdir()
+    _, file, _ = compiled("a", 10 * 75 + 76, tmp_path)
     file.write_bytes(b"damaged")
     usual = FakeLibrary.__getattr__
 
@@ -137,16 +143,29 @@ def test_a_damaged_file_of_the_cache_is_compiled_anew(
         return load if name == "cuModuleLoadData" else usual(self, name)
 
     monkeypatch.setattr(FakeLibrary, "__getattr__", refuse_damaged)
-    kernels = CudaDevice().load("a")
+    device = CudaDevice()
+    kernels = device.load("a")
     assert kernels.new
+    assert device.load("a") is kernels
+    kernels.keep()
     assert file.read_bytes() == b"code of a"
+
+
+def test_code_that_the_driver_refuses_is_compiled_once(
+    nvrtc, library_of, monkeypatch, tmp_path
+) -> None:
+    library_of("cuModuleLoadData")
+    monkeypatch.setattr(devices, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(FakeNvrtc, "architectures", (10 * 75 + 76,))
+    with pytest.raises(Unavailable, match="cuModuleLoadData of the CUDA driver failed"):
+        CudaDevice().load("a")
+    assert len(nvrtc.compiled) == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_launch_sends_sizes_stream_and_arguments(library_of, tmp_path) -> None:
     library, file = library_of(), tmp_path / "kernels"
-    file.write_bytes(b"code")
-    kernels = CudaKernels(CudaDevice(), b"code", file)
-    assert kernels.new
+    kernels = CudaKernels(CudaDevice(), b"code", file, new=True)
     arguments = [ffi.new("int *", 5), ffi.new("float *", 2.5)]
     kernels.launch("train_bricks", 12, 256, 70_000, arguments, 77)
     kernels.launch("train_bricks", 12, 256, 70_000, arguments, 77)
@@ -170,8 +189,19 @@ def test_a_launch_sends_sizes_stream_and_arguments(library_of, tmp_path) -> None
     for name, *_ in library.calls:
         depth += {"cuCtxPushCurrent_v2": 1, "cuCtxPopCurrent_v2": -1}.get(name, 0)
         assert depth == int(name.startswith(("cuMod", "cuFunc", "cuLaunch"))) or "Ctx" in name
-    kernels.forget()
     assert not file.exists()
+    kernels.keep()
+    assert not kernels.new
+    assert file.read_bytes() == b"code"
+
+
+def test_shared_memory_of_a_kernel_only_grows(library_of, tmp_path) -> None:
+    library = library_of()
+    kernels = CudaKernels(CudaDevice(), b"code", tmp_path / "kernels", new=False)
+    for shared_bytes in (80_000, 30_000, 80_000, 90_000):
+        kernels.launch("a", 1, 32, shared_bytes, [])
+    asked = [call[3] for call in library.calls if call[0] == "cuFuncSetAttribute"]
+    assert asked == [80_000, 90_000]
 
 
 def test_memory_holds_what_is_sent_and_is_freed(library_of) -> None:
@@ -187,11 +217,19 @@ def test_memory_holds_what_is_sent_and_is_freed(library_of) -> None:
     assert ("cuMemFree_v2", address) in library.calls
 
 
+def test_memory_is_left_in_silence_behind_a_kernel_that_failed(library_of, recwarn) -> None:
+    library = library_of()
+    memory = CudaDevice().memory(8)
+    library.failing = "cuMemFree_v2"
+    del memory  # pytest turns an exception that nobody can catch into a warning
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize("failing", ["cuInit", "cuModuleLoadData", "cuLaunchKernel"])
 def test_failures_of_the_driver_name_the_call_and_its_reason(library_of, failing) -> None:
     library_of(failing)
     with pytest.raises(Unavailable, match=f"{failing} of the CUDA driver failed: a reason"):
-        CudaKernels(CudaDevice(), b"code", None).launch("a", 1, 32, 0, [])
+        CudaKernels(CudaDevice(), b"code", Path(), new=True).launch("a", 1, 32, 0, [])
 
 
 def test_too_little_memory_is_a_memory_error(library_of) -> None:
@@ -216,3 +254,19 @@ def test_a_library_is_looked_for_in_nvidias_packages_first(monkeypatch, tmp_path
     monkeypatch.setattr(compilers, "_folders", lambda: [folder, tmp_path / "none"])
     with pytest.raises(Unavailable, match=re.escape(str(folder / "libnvrtc"))):
         find_nvrtc()
+
+
+def test_a_library_newer_than_the_driver_is_passed_over(monkeypatch, tmp_path) -> None:
+    for number in (12, 13):
+        (tmp_path / f"libnvrtc.so.{number}").write_text("")
+
+    class Loaded:
+        def __init__(self, path) -> None:
+            self.path, self.version = path, (int(path.suffix[1:]), 0)
+
+    monkeypatch.setattr(compilers, "Nvrtc", Loaded)
+    monkeypatch.setattr(compilers, "_folders", lambda: [tmp_path])
+    assert find_nvrtc().version == find_nvrtc(13).version == (13, 0)
+    assert find_nvrtc(12).version == (12, 0)
+    with pytest.raises(Unavailable, match=r"is of CUDA 12, and the driver of CUDA 11"):
+        find_nvrtc(11)

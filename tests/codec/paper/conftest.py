@@ -25,7 +25,7 @@ from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.network import Architecture, ArrayTable, Network, level_resolutions
 from fhash_codec.paper.storage import Bricks
 from fhash_codec.paper.tables import TrainedTable, trained_tables
-from fhash_codec.paper.train import Probe, TrainingProgress, plan_training, train
+from fhash_codec.paper.train import plan_training
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 from fhash_formats.support.values import Single
@@ -186,40 +186,6 @@ def _in_coreset(coreset: Coreset) -> npt.NDArray[np.bool_]:
     return np.unpackbits(coreset.mask_bits, axis=1, count=prod(coreset.brick_shape)).astype(bool)
 
 
-def _trained(coreset: Coreset, settings: dict[str, Any], name: str, device: str) -> dict[str, Any]:
-    """Train an engine, go on from its state in another one, and return what came of it."""
-    key_frames, samples = len(coreset.key_frames), len(coreset.values)
-    architecture = Architecture.for_box(coreset.box.shape, key_frames, **{"width": 16, **settings})
-    plan = plan_training(
-        coreset, epochs=1, learning_rate=0.01, schedule="constant", batch=samples // 4 + 1, seed=0
-    )
-    rates = np.append(plan.rates, [0.01, 0.01])
-
-    def new() -> Any:
-        return make_engine(name, architecture, coreset, rates, seed=7, device=device)
-
-    first, second, every = new(), new(), np.arange(len(coreset.bricks))
-    train(first, plan, coreset, TrainingProgress())
-    second.restore({name: np.array(array) for name, array in first.state().items()})
-    for _ in range(2):
-        error = float(second.train(every[::2].copy()))
-    psnr, values = Probe(coreset).psnr(second), second.infer(every)
-    second.settle()
-    parameters = second.parameters()
-    return {
-        "error": error,
-        "psnr": psnr,
-        "values": values,
-        **{part: getattr(parameters, part) for part in ("fine", "coarse", "network")},
-    }
-
-
-@pytest.fixture(scope="session")
-def trained() -> Callable[..., dict[str, Any]]:
-    """A function of (coreset, settings, name, device): what a training and a continuation give."""
-    return _trained
-
-
 @pytest.fixture(scope="session")
 def noise_coreset() -> Callable[..., Coreset]:
     """A function of (shape, low, fringe, keys): noise; values from `low` to 1 are the feature.
@@ -362,10 +328,10 @@ def other_coreset() -> Coreset:
 def setup() -> Callable[..., Any]:
     """A function of a coreset and settings: the plan and an engine."""
 
-    def make(coreset: Coreset, epochs: int = 4, engine: str = "auto", **settings: Any) -> Any:
+    def make(coreset: Coreset, epochs: int = 4, **settings: Any) -> Any:
         usual = {"learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5}
         plan = plan_training(coreset, epochs=epochs, **usual | settings)
         architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
-        return plan, make_engine(engine, architecture, coreset, plan.rates, seed=5, device="cpu")
+        return plan, make_engine(architecture, coreset, plan.rates, seed=5, device="cpu")
 
     return make

@@ -211,7 +211,7 @@ def test_training_that_diverges_is_an_error(setup, coreset) -> None:
 def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hidden_layers) -> None:
     plan = plan_training(coreset, epochs=4, learning_rate=1.0, schedule="constant", batch=0, seed=5)
     architecture = Architecture.for_box(coreset.box.shape, 3, width=64, hidden_layers=hidden_layers)
-    engine = make_engine("auto", architecture, coreset, plan.rates, seed=5, device="cpu")
+    engine = make_engine(architecture, coreset, plan.rates, seed=5, device="cpu")
     reached = TrainingProgress()
     with pytest.raises(Diverged, match="training diverged in epoch 1: the error reached"):
         train(engine, plan, coreset, reached)

@@ -225,7 +225,8 @@ def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
     device: str,
 ) -> None:
     module = "fhash_codec.rendering.plan"
-    monkeypatch.setattr(f"{module}.has_device", lambda: gpu)
+    for place in (module, "fhash_codec.devices"):
+        monkeypatch.setattr(f"{place}.has_device", lambda: gpu)
     monkeypatch.setattr(f"{module}.CUDA_START", 0.0)  # any picture pays
     with fhash_codec.open(files["paper"]) as network:
         planned = plan(network, march=march)
@@ -245,7 +246,7 @@ def test_a_device_is_taken_where_its_start_pays(
     module = "fhash_codec.rendering.plan"
     monkeypatch.setattr(f"{module}.usable_threads", lambda: 4)
     scene = Scene.from_dict({"size": [512, 512]})
-    assert plan_picture(volume, scene).why_device == "there is no CUDA device"
+    assert plan_picture(volume, scene, pictures=1000).why_device == "there is no CUDA device"
     with pytest.raises(InputError, match="no CUDA device here; use --device cpu"):
         plan(volume, march={"device": "cuda"})
     monkeypatch.setattr(f"{module}.has_device", lambda: True)

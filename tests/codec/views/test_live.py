@@ -20,13 +20,12 @@ from PIL import Image
 from test_server import Answer, Ask, asking, raw
 
 import fhash_codec
-from fhash_codec.cuda.device import has_device
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import USUAL_EFFECTS, Camera, Effects, Scene
 from fhash_codec.views.live import PAGE, Live
 from fhash_codec.views.page import Page
 from fhash_codec.views.server import Server
-from fhash_formats.errors import DamagedFileError, FhashError
+from fhash_formats.errors import DamagedFileError
 
 SMALL = "width=200&height=160"
 
@@ -245,12 +244,6 @@ def test_a_failure_is_one_of_one_answer(
         assert headers["Cache-Control"] == "no-store"
         assert news == [f"picture: {line}"]
         assert asking(server)(f"/picture?{SMALL}")[0] == 200
-
-
-@pytest.mark.skipif(has_device(), reason="there is a CUDA device")
-def test_a_device_that_is_not_there_is_refused_at_once(whole: Path) -> None:
-    with fhash_codec.open(whole) as volume, pytest.raises(FhashError, match="cuda"):
-        Live(volume, device="cuda")
 
 
 def test_the_page_is_no_file_of_the_other_page(whole: Path) -> None:

@@ -136,6 +136,7 @@ class FusedEngine:
         self._errors = torch.empty(self._slots, dtype=torch.float64, device=device)
         if self._program.new:
             self._try_kernels()
+            self._program.keep()
 
     @property
     def rates(self) -> npt.NDArray[np.float64]:
@@ -323,7 +324,6 @@ class FusedEngine:
         wrong_errors = not np.allclose(errors, native_errors, rtol=TRIAL_ERROR, atol=1e-9)
         difference = float(np.median(np.abs(values - native_values)))
         if wrong_errors or not difference <= TRIAL_VALUE:
-            self._program.forget()
             raise Unavailable(
                 f"the kernels gave other results than native on this device: {errors.tolist()}"
                 f" instead of {native_errors.tolist()}, values {difference:.2g} apart"
@@ -536,7 +536,7 @@ class FusedPoints:
         )
         if self._program.new:
             self._try_kernels(PointTables.of_box(network, key).at(key))
-            self._program.new = False
+            self._program.keep()
         else:
             # A kernel that cannot be launched is found before the first picture.
             nowhere = torch.empty((0, 3), dtype=torch.float64, device=device)
@@ -600,7 +600,6 @@ class FusedPoints:
         ):
             apart = float(np.median(np.abs(ours.cpu().numpy() - theirs)))
             if not apart <= POINTS_ERROR * float(np.abs(theirs).max()):
-                self._program.forget()
                 raise Unavailable(f"the kernels gave other {name} than the host, {apart:.2g} apart")
 
 

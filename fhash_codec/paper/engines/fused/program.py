@@ -373,22 +373,23 @@ class CudaProgram:
     """Kernels that are launched after the work that torch has queued.
 
     Attributes:
-        new: as `Kernels` has it.
+        keep: as `Kernels` has it.
     """
 
     def __init__(self, kernels: Kernels, device: torch.device, threads: int) -> None:
         """Take over the kernels of a device; threads: of a block."""
         self._kernels, self._device, self._threads = kernels, device, threads
-        self.new = kernels.new
+        self.keep = kernels.keep
+
+    @property
+    def new(self) -> bool:
+        """As `Kernels` has it."""
+        return self._kernels.new
 
     def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
         """Launch a kernel; arguments and errors as in `Kernels.launch`."""
         stream = torch.cuda.current_stream(self._device).cuda_stream
         self._kernels.launch(kernel, blocks, self._threads, shared_bytes, arguments, stream)
-
-    def forget(self) -> None:
-        """Remove the kernels from the cache."""
-        self._kernels.forget()
 
 
 class CudaDevice:

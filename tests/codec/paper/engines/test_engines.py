@@ -31,20 +31,12 @@ from fhash_formats.errors import InputError
 CPU = torch.device("cpu")
 
 
-def test_unknown_engines_are_refused(noise_coreset) -> None:
-    architecture = Architecture.for_box((2, 2, 2), 1)
-    with pytest.raises(InputError, match="unknown engine 'quick'"):
-        make_engine(
-            "quick", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device="cpu"
-        )
-
-
-def test_auto_is_native_on_a_cpu(noise_coreset) -> None:
+def test_a_cpu_has_the_native_engine(noise_coreset) -> None:
     coreset = noise_coreset((1, 2, 2, 2))
 
     def chosen(hidden_layers):
         architecture = Architecture.for_box((2, 2, 2), 1, hidden_layers=hidden_layers)
-        return make_engine("auto", architecture, coreset, np.zeros(1), seed=0, device="cpu")
+        return make_engine(architecture, coreset, np.zeros(1), seed=0, device="cpu")
 
     assert describe_engine(chosen(2), 3) == {
         "engine": "native",
@@ -53,14 +45,6 @@ def test_auto_is_native_on_a_cpu(noise_coreset) -> None:
     }
     with pytest.raises(InputError, match="2 hidden layers at most, not 3"):
         chosen(3)
-
-
-def test_the_fused_engine_needs_a_cuda_device(noise_coreset) -> None:
-    architecture = Architecture.for_box((2, 2, 2), 1)
-    with pytest.raises(InputError, match="'fused', which needs a CUDA device"):
-        make_engine(
-            "fused", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device="cpu"
-        )
 
 
 def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:

@@ -14,7 +14,6 @@ from engine_checks import assert_near
 from readable_paper import NaiveEngine
 
 from fhash_codec.native.network import PATHS, machine_paths
-from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.engines.native import NativeEngine, refusal
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
@@ -190,8 +189,6 @@ def test_what_it_does_not_take_is_named(model_of) -> None:
     refused("2 hidden layers at most, not 3", hidden_layers=3)
     refused("128 neurons at most, not 129", width=129)
     assert refusal(replace(architecture, width=1024, hidden_layers=0)) is None
-    with pytest.raises(InputError, match=r"native' does not take .* device is 'cuda'"):
-        make_engine("native", architecture, coreset, RATES, seed=7, device="cuda")
     with pytest.raises(InputError, match="path is 'quick'"):
         NativeEngine(architecture, coreset, RATES, seed=7, path="quick")
 

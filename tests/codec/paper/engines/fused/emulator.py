@@ -26,21 +26,25 @@ class EmulatedProgram:
     """Kernels for some sizes, whose threads run in `order`."""
 
     def __init__(self, kernels: EmulatedKernels, threads: int) -> None:
-        self.kernels, self.new, self._threads = kernels, kernels.new, threads
+        self.kernels, self._threads = kernels, threads
 
     @property
     def launched(self) -> list[str]:
         return self.kernels.launched
 
     @property
-    def forgotten(self) -> bool:
-        return self.kernels.forgotten
+    def new(self) -> bool:
+        return self.kernels.new
+
+    @property
+    def kept(self) -> bool:
+        return self.kernels.kept
 
     def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
         self.kernels.launch(kernel, blocks, self._threads, shared_bytes, arguments)
 
-    def forget(self) -> None:
-        self.kernels.forget()
+    def keep(self) -> None:
+        self.kernels.keep()
 
 
 class EmulatedDevice:

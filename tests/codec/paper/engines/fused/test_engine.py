@@ -188,7 +188,7 @@ def test_new_kernels_are_tried_first(engines_of, shape, settings, old, new) -> N
         return
     coreset, fused, native, _ = engines_of(shape, settings, new=True)
     assert fused._program.launched
-    assert not fused._program.forgotten
+    assert fused._program.kept
     begun = native.state()
     for name, array in fused.state().items():
         np.testing.assert_array_equal(array, begun[name], err_msg=name)
@@ -368,7 +368,7 @@ def test_new_kernels_are_tried_first_points(points_of, networks, old, new) -> No
     network = networks.random((5, 13, 18), 4, 2, 2, 1)
     points = points_of(network, new=True)
     assert points._program.launched == ["values_at", "slopes_at"]
-    assert not points._program.forgotten
+    assert points._program.kept
     assert not points._program.new
 
     def change(text):
@@ -438,7 +438,6 @@ def encoded_on_cuda(tmp_path, monkeypatch, emulated):
         {"key_frames": "0,2"},
         {"tables": "transform"},
         {"tables": "auto", "psnr": 12.5, "epochs": 0},
-        {"device": "auto", "engine": "fused"},
     ],
     ids=str,
 )
@@ -471,19 +470,13 @@ def test_what_cuda_cannot_do_is_refused_or_left_to_the_cpu(
         return without_nvrtc(device) if limits is None else emulated(**limits)
 
     monkeypatch.setattr("fhash_codec.devices.CUDA_PAYS", 0.0)
-    for named in ({}, {"device": "auto", "engine": "fused"}):
-        with pytest.raises(InputError, match=rf"{reason}.*; use .*--device cpu$") as error:
-            encoded_on_cuda(make, **changes | named)
-        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match=rf"{reason}.*; use --device cpu$") as error:
+        encoded_on_cuda(make, **changes)
+    assert "\n" not in str(error.value)
     figures = encoded_on_cuda(make, device="auto", **changes)
     assert (figures["device"], figures["engine"]) == ("cpu", "native")
     (why,) = [stage["why"] for stage in figures["stages"] if stage["stage"] == "engine"]
     assert re.search(f"on the CPU, as .*{reason}", why)
-
-
-def test_an_engine_that_is_named_is_taken_without_cuda(encoded_on_cuda, monkeypatch) -> None:
-    monkeypatch.setattr("fhash_codec.devices.CUDA_PAYS", 0.0)
-    assert encoded_on_cuda(device="auto", engine="native")["device"] == "cpu"
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def sizes_of(noise_coreset):
 def test_kernels_need_few_registers_and_no_local_memory(
     nvrtc_nvrtc, sizes_of, architecture, width, layers, size, keys
 ) -> None:
-    """With key frames, the finest level is interpolated, too."""
+    """The finest level is interpolated, too, between key frames."""
     sizes = sizes_of(architecture, keys, width=width, hidden_layers=layers, embedding_size=size)
     assert assert_few_resources(nvrtc_nvrtc, sizes, architecture) == {
         "train_bricks",
