@@ -107,7 +107,7 @@ lib:
 paraview: .venv/.vtk
 	FHASH_PARAVIEW=$(CURDIR)/build/paraview $(BIN)/python -m pytest -rs -m "" tests/codec/views/test_vtk.py
 
-# Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/howto/gpu.md): 7 minutes.
+# Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/howto/gpu.md): 8 minutes.
 device:
 	$(PYTHON) setup.py -q build_ext --inplace
 	$(PYTHON) tests/device/run.py build/device

@@ -13,10 +13,12 @@ namespace {
 // Whether the network has a value at a place within the frame.
 FHASH_INLINE bool known_at(const FhashInput& m, float x, float y, float z) {
     if (m.network_whole) return true;
-    double at[3] = {x, y, z}, rates[3];
-    to_box(m, at, rates);
-    const float there =
-        value_at(m.network_shape, m.values, (float)at[0], (float)at[1], (float)at[2]);
+    if (m.network_x || m.network_y || m.network_z) {
+        double at[3] = {x, y, z}, rates[3];
+        to_box(m, at, rates);
+        x = (float)at[0]; y = (float)at[1]; z = (float)at[2];
+    }
+    const float there = value_at(m.network_shape, m.values, x, y, z);
     return there == there;
 }
 

@@ -2,5 +2,6 @@
 
 arrays and view: the hierarchy; server and store: two ways to it; pack and unpack: Zarr stores whose
 chunks are tiles.
-Imports volumes and datasets. No picture is drawn here.
+live: pictures that are drawn for a page while the mouse moves.
+Imports volumes, datasets and, for live alone, rendering.
 """

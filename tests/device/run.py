@@ -1,18 +1,21 @@
 """Figures that only a machine with a GPU gives: `make device`, or run.py FOLDER (see the GPU page).
 
-It takes at most 7 minutes and needs no network; selftest needs zarr, for which wheels in a folder
+It takes at most 8 minutes and needs no network; selftest needs zarr, for which wheels in a folder
 on PYTHONPATH will do. Each part is a process of its own with a limit in seconds, so that one that
 hangs or breaks the device leaves time to the others, and keeps what it has. FOLDER/figures.json is
 written anew after each part. Whatever fails or is left out makes the exit code 1.
 
 Parts, the most important first:
-- machine: device, software, peaks, seconds to start CUDA
-- oracle: gradients, values and bits of fused and native, against the naive engine in float64
+- machine: device, software, seconds to start CUDA with and without torch, peaks
+- pictures: the marcher's kernels against the CPU's pictures, milliseconds, and a film, of a default
+  and a published file of 256^3
+- oracle: gradients, values and bits of fused and native, against the naive engine in float64, also
+  between sparse key frames
+- head: updates of the default's MLP, by kernels and by the CPU, and whether their bits are the same
 - speed: training and evaluation by model and batch, steps one after another, and memory
 - curve: PSNR against seconds of training
 - card: the commands encode, diff and render (pictures and a film), on the device
-- points: places in a network by fused kernels and on the host
-- selftest: `fhash selftest`, whose trainings choose the device
+- selftest: `fhash selftest`, whose trainings choose the device and whose pictures it draws
 
 `--device cpu --quick` tries the script itself without a GPU; its figures mean nothing.
 """
@@ -31,6 +34,7 @@ import tomllib
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -41,11 +45,23 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / name) for name in ("", "formats", "cli", "benchmarks", "tests/device")]
+sys.path[:0] = [str(ROOT / name) for name in ("", "formats", "cli", "benchmarks")]
 sys.path.append(str(ROOT / "tests" / "codec"))  # the readable paper
 FHASH = "import sys; from fhash_cli.main import main; sys.argv[0] = 'fhash'; sys.exit(main())"
 """Program of the command line, which need not be installed."""
-TOTAL_SECONDS = 410.0
+START = """
+import json, time
+begun = time.perf_counter()
+from fhash_codec.cuda.device import first_device
+imported = time.perf_counter()
+device = first_device()
+device.memory(1 << 20).clear()
+device.wait()
+started = time.perf_counter()
+print(json.dumps({"import_ours_s": imported - begun, "start_ours_s": started - imported}))
+"""
+"""Program that starts CUDA as a picture does, without torch."""
+TOTAL_SECONDS = 470.0
 """Seconds of all parts."""
 MODELS = ((64, 1), (64, 2), (16, 1), (128, 2))
 """Width and hidden layers of the measured models."""
@@ -68,7 +84,8 @@ class Run:
         self.curve_seconds = 0.5 if quick else 15.0
         self.pixels = 32 if quick else 1024
         self.epochs = 1 if quick else 20
-        self.side = 16 if quick else 160
+        self.side = 24 if quick else 256
+        self.frames = 3 if quick else 24
         self.cases = ["--case", "layers"] if quick else []
 
     @property
@@ -223,10 +240,14 @@ def machine(run: Run) -> Iterator[Result]:
         "start_device_s": started - imported,
     }
     if run.on_cuda:
+        from fhash_codec.cuda.device import driver
         from fhash_codec.cuda.nvrtc import find_nvrtc
 
-        nvrtc = find_nvrtc()
+        nvrtc = find_nvrtc(driver().version())
         found |= {"nvrtc": f"{nvrtc.path} {nvrtc.version}", "cuda": str(torch.version.cuda)}
+        words = [sys.executable, "-c", START]
+        done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment())
+        found |= json.loads(done.stdout)
     yield found
     from fhash_bench.engines import Peaks
 
@@ -240,14 +261,18 @@ def machine(run: Run) -> Iterator[Result]:
         }
 
 
-def coreset_of(series: Any, feature: str, dilation: int = 1) -> Any:
-    """Return the coreset of all steps of a series."""
+def coreset_of(series: Any, feature: str, dilation: int = 1, key_frames: str = "all") -> Any:
+    """Return the coreset of a series: all steps, or the key frames and samples between them."""
     from fhash_codec.config import EncodeConfig
     from fhash_codec.paper.encode import select
     from fhash_codec.progress import silent
 
     config = EncodeConfig(
-        preset="published", tables="float16", features=(feature,), dilation=dilation
+        preset="published",
+        tables="float16",
+        features=(feature,),
+        dilation=dilation,
+        key_frames=key_frames,
     )
     return select(series, config, silent).coreset
 
@@ -268,6 +293,117 @@ def architecture_of(coreset: Any, width: int, layers: int) -> Any:
     return Architecture.for_box(shape, steps, hidden_layers=layers, width=width)
 
 
+def pictures(run: Run) -> Iterator[Result]:
+    """Draw files of a front by kernels and by the CPU: how far apart, how fast, in what memory."""
+    from fhash_codec import EncodeConfig, Renderer, Scene, encode, open
+    from fhash_codec.simulation.simulate import simulate
+
+    series = simulate("front", (3, *(run.side,) * 3))
+    values = np.stack([series.read(step) for step in range(3)])
+    published = dict(preset="published", tables="float16", epochs=2, features=("interval:0.05:2",))
+    kinds = {"default": EncodeConfig(effort=1), "published": EncodeConfig(**published)}
+    surfaces = {"isosurfaces": [{"value": 0.4, "opacity": 0.6}, {"value": 0.7}]}
+    lit = {"shading": True, "shadows": True, "ambient_occlusion": True}
+    scenes = {"usual": {"shading": True}, "bare": {}, "surfaces": surfaces}
+    scenes |= {"light": lit, "maximum": {"maximum_intensity": True}}
+    for kind, config in kinds.items():
+        path = run.work / f"{kind}.fhz"
+        encode(values, path, config)
+        for (name, effects), mode in product(scenes.items(), ("cache", "arm")):
+            result: Result = {"file": kind, "scene": name, "march": mode}
+            drawn = {}
+            try:
+                for device in dict.fromkeys(("cpu", run.device)):
+                    march = {"mode": mode, "device": device, "lod": 0}
+                    scene = Scene.from_dict(
+                        {"size": [512, 512], "effects": effects, "march": march}
+                    )
+                    with open(path) as volume:
+                        renderer = Renderer(volume)
+                        times = {}
+                        for turn, step in (("first", 0), ("again", 0), ("third", 0), ("next", 1)):
+                            begun = time.perf_counter()
+                            image = renderer.render(replace(scene, step=step))
+                            times[turn] = round(1000 * (time.perf_counter() - begun), 1)
+                    drawn[device], result[f"{device}_ms"] = image.rgba, times
+                    result[f"{device}_samples"] = image.counters["samples"]
+                    result[f"{device}_evaluations"] = image.counters["evaluations"]
+                apart = np.abs(drawn[run.device] - drawn["cpu"])
+                result |= {"apart": float(apart.max()), "apart_mean": float(apart.mean())}
+                if float(np.quantile(apart, 0.999)) > 5e-4:
+                    result["failed"] = "another picture than the CPU's"
+            except Exception as error:
+                traceback.print_exc()
+                result["failed"] = short(error)
+            yield result
+        yield film_of(run, kind, path)
+
+
+def film_of(run: Run, kind: str, path: Path) -> Result:
+    """Turn the camera around a file: pictures a second, the first left out, and memory."""
+    from fhash_codec import Renderer, Scene, open
+
+    with open(path) as volume:
+        renderer = Renderer(volume, pictures=run.frames)
+        march = {"device": run.device, "mode": "arm" if kind == "published" else "cache", "lod": 0}
+        times = []
+        for number in range(run.frames):
+            camera = {"azimuth": 360 * number / run.frames}
+            given = {"size": [512, 512], "step": 0, "camera": camera, "march": march}
+            begun = time.perf_counter()
+            renderer.render(Scene.from_dict({**given, "effects": {"shading": True}}))
+            times.append(time.perf_counter() - begun)
+    result = {"file": kind, "film_pictures_s": (run.frames - 1) / sum(times[1:])}
+    if run.on_cuda:
+        from fhash_codec.cuda.device import first_device
+
+        result["free_mb"] = first_device().free() / 1e6
+    return result
+
+
+def head(run: Run) -> Iterator[Result]:
+    """Train MLPs of the default's sizes by kernels and by the CPU."""
+    from fhash_codec.compact.head_device import device_learner
+    from fhash_codec.compact.head_training import (
+        BATCH_VOXELS,
+        Batches,
+        Network,
+        adam_factors,
+        native_learner,
+    )
+    from fhash_formats.transform.head import INPUTS
+
+    random, batches = np.random.default_rng(0), 20
+    blocks = BATCH_VOXELS // 64
+    voxels = Batches(
+        inputs=random.integers(-1024, 1024, (batches, blocks, INPUTS, 64)).astype(np.int16),
+        targets=random.integers(-50_000, 50_000, (batches, BATCH_VOXELS)).astype(np.int32),
+        lowest=np.full((batches, BATCH_VOXELS), -(1 << 20), np.int32),
+        highest=np.full((batches, BATCH_VOXELS), 1 << 20, np.int32),
+        weights=random.random((batches, BATCH_VOXELS), np.float32),
+    )
+    learners = {"cpu": native_learner(voxels)}
+    if run.on_cuda:
+        from fhash_codec.cuda.device import first_device
+
+        learners["cuda"] = device_learner(first_device(), voxels)
+    updates = 40 if run.seconds < 0.1 else 1000
+    rates, roots = adam_factors(np.full(updates + 20, 0.01))
+    for widths in ((12, 8), (24, 16), (48, 16)):
+        result: Result = {"widths": f"{widths[0]}x{widths[1]}"}
+        parameters = {}
+        for device, learn in learners.items():
+            network = Network(widths, np.random.default_rng(1))
+            learn(network, 0, rates[:20], roots[:20], False)
+            begun = time.perf_counter()
+            learn(network, 20, rates[20:], roots[20:], False)
+            result[f"{device}_updates_s"] = updates / (time.perf_counter() - begun)
+            parameters[device] = network.parameters
+        if not all(np.array_equal(each, parameters["cpu"]) for each in parameters.values()):
+            result["failed"] = "other bits than the CPU's"
+        yield result
+
+
 def oracle(run: Run) -> Iterator[Result]:
     """Compare a step and the values of each engine with the naive engine in float64, on the CPU.
 
@@ -282,21 +418,25 @@ def oracle(run: Run) -> Iterator[Result]:
     from fhash_codec.paper.engines.parameters import coarse_axes, used_numbers
     from fhash_formats.series import ArraySeries
 
-    noise = ArraySeries(np.random.default_rng(3).random((3, 9, 20, 35), dtype=np.float32))
-    coreset = coreset_of(noise, "interval:0.3:1", dilation=0)
-    every, rates = np.arange(len(coreset.bricks)), np.full(9, 0.01)
-    for width, layers in (*MODELS, (64, 0)):
-        model = architecture_of(coreset, width, layers)
+    noise = ArraySeries(np.random.default_rng(3).random((4, 9, 20, 35), dtype=np.float32))
+    coresets = {
+        keys: coreset_of(noise, "interval:0.3:1", dilation=0, key_frames=keys)
+        for keys in ("all", "0,3")
+    }
+    rates = np.full(9, 0.01)
+    for (width, layers), (keys, coreset) in product((*MODELS, (64, 0)), coresets.items()):
+        every, model = np.arange(len(coreset.bricks)), architecture_of(coreset, width, layers)
         naive = NaiveEngine(model, coreset, rates, seed=1)
         naive.train(every)
         layer_gradients = [
             torch.column_stack([weight.grad, bias.grad]).flatten()
             for weight, bias in zip(naive.model.weights, naive.model.biases, strict=True)
         ]
-        tables = torch.cat([table.grad.flatten() for table in list(naive.model.tables)[1:]])
+        coarse = list(naive.model.tables)[coreset.lattice is None :]
+        tables = torch.cat([table.grad.flatten() for table in coarse])
         for name in run.engines:
             make = partial(make_engine, model, coreset, rates, seed=1, device=run.device_of(name))
-            result: Result = {"engine": name, "model": f"{width}x{layers}"}
+            result: Result = {"engine": name, "model": f"{width}x{layers}", "keys": keys}
             try:
                 engine: Any = make()
                 engine.train(every)
@@ -437,7 +577,22 @@ def card(run: Run) -> Iterator[Result]:
     from PIL import Image
 
     path, data = run.work / "front.fhz", run.data
-    options = ["--preset=published", "--tables=float16", "-v"]
+    published = ["--preset=published", "--tables=float16"]
+    for name, options in (
+        ("default", ["--effort=1"]),
+        ("sparse keys", [*published, "--key-frames=every:4", "--epochs=2"]),
+    ):
+        other = run.work / f"{name}.fhz"
+        words = ["encode", str(data), "-o", str(other), "-v", "--force", "--device", run.device]
+        encoded = fhash([*words, *options])
+        trained = fhash(["info", str(other)])["training"]
+        result = {"command": f"encode, {name}", "device": trained["device"]}
+        result |= {name: encoded[name] for name in ("call_s", "seconds", "psnr", "bytes")}
+        result["stages"] = {each["stage"]: each["seconds"] for each in encoded["stages"]}
+        if trained["device"] not in (run.device, "none"):
+            result["failed"] = f"trained on {trained['device']}"
+        yield result
+    options = [*published, "-v"]
     words = ["encode", str(data), "-o", str(path), *options]
     encoded = fhash([*words, "--device", run.device, "--epochs", str(run.epochs)])
     trained = fhash(["info", str(path)])["training"]
@@ -477,16 +632,10 @@ def card(run: Run) -> Iterator[Result]:
     yield {"command": "film", **{name: found[name] for name in ("call_s", "seconds")}}
 
 
-def points(run: Run) -> Iterator[Result]:
-    """Measure places in networks, in the order of rays and at random; compare the kernels."""
-    from network_points import measured_points
-
-    yield from measured_points(run.device, run.shape, run.side, run.seconds / 2)
-
-
 def selftest(run: Run) -> Iterator[Result]:
-    """Return what does not hold in `fhash selftest`, whose trainings choose the device."""
-    found = fhash(["selftest", *run.cases], allowed=(0, 1))
+    """Return what does not hold in `fhash selftest`; a device draws its pictures, too."""
+    program = f"import fhash_codec.rendering.plan as p; p.CUDA_START = -1.0; {FHASH}"
+    found = fhash(["selftest", "--processes", "1", *run.cases], allowed=(0, 1), program=program)
     wrong = [
         {"case": case["name"], **finding}
         for case in found["cases"]
@@ -497,18 +646,26 @@ def selftest(run: Run) -> Iterator[Result]:
     yield result if found["holds"] else result | {"failed": wrong}
 
 
-def fhash(words: list[str], allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
+def environment() -> dict[str, str]:
+    """Return the environment of a program that imports what this one does."""
+    return {**os.environ, "PYTHONPATH": ":".join(sys.path)}
+
+
+def fhash(
+    words: list[str], allowed: tuple[int, ...] = (0,), program: str = FHASH
+) -> dict[str, Any]:
     """Run the command line; return what it prints as JSON, and `call_s`, its seconds in all."""
     begun = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", FHASH, *words, "--json"],
+        [sys.executable, "-c", program, *words, "--json"],
         capture_output=True,
         text=True,
-        env={**os.environ, "PYTHONPATH": ":".join(sys.path)},
+        env=environment(),
         check=False,
     )
-    # A warning says that kernels cannot be had, which a user may overlook.
-    if done.returncode not in allowed or "cannot be had" in done.stderr:
+    # Warnings say that a device cannot draw, or a training begin there, which a user may overlook.
+    missing = "cannot be had" in done.stderr or "the CPU draws" in done.stderr
+    if done.returncode not in allowed or missing:
         raise RuntimeError(f"fhash {' '.join(words)}: exit {done.returncode}: {done.stderr[-800:]}")
     print(done.stderr, end="", file=sys.stderr)
     return {**json.loads(done.stdout), "call_s": time.perf_counter() - begun}
@@ -516,11 +673,12 @@ def fhash(words: list[str], allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
 
 PARTS: dict[str, tuple[Callable[[Run], Iterator[Result]], float]] = {
     "machine": (machine, 60.0),
-    "oracle": (oracle, 100.0),
-    "speed": (speed, 170.0),
+    "pictures": (pictures, 150.0),
+    "oracle": (oracle, 120.0),
+    "head": (head, 30.0),
+    "speed": (speed, 150.0),
     "curve": (curve, 90.0),
     "card": (card, 120.0),
-    "points": (points, 40.0),
     "selftest": (selftest, 150.0),
 }
 """The parts and their limits in seconds."""

@@ -18,14 +18,14 @@ SCRIPT = Path(__file__).parent / "run.py"
 ROOT = SCRIPT.parents[2]
 HANGS = """    yield {"done": 1}
     time.sleep(60)
-    yield from measured_points("""
+    random, batches ="""
 
 
 @pytest.mark.torch
 def test_the_parts_run_without_zarr(tmp_path) -> None:
     words = [str(SCRIPT), str(tmp_path), "--device", "cpu", "--quick"]
     done = subprocess.run(
-        [sys.executable, *words, "--parts", "speed,curve,card,points"],
+        [sys.executable, *words, "--parts", "pictures,oracle,head,speed,curve,card"],
         capture_output=True,
         text=True,
         check=False,
@@ -38,9 +38,13 @@ def test_the_parts_run_without_zarr(tmp_path) -> None:
     assert min(rates) > 0
     assert all(row["epochs"] == 1 for row in figures["curve"]["figures"])
     commands = [row["command"] for row in figures["card"]["figures"]]
-    assert commands == ["encode", "diff", "arm", "stream", "arm", "film"]
-    assert len(figures["points"]["figures"]) == 6
-    assert all(row["host_slopes_mpoints_s"] > 0 for row in figures["points"]["figures"])
+    encodes = ["encode, default", "encode, sparse keys", "encode"]
+    assert commands == [*encodes, "diff", "arm", "stream", "arm", "film"]
+    drawn = figures["pictures"]["figures"]
+    assert len([row for row in drawn if "scene" in row]) == 20
+    assert len([row for row in drawn if "film_pictures_s" in row]) == 2
+    assert {row["keys"] for row in figures["oracle"]["figures"]} == {"all", "0,3"}
+    assert all(row["cpu_updates_s"] > 0 for row in figures["head"]["figures"])
 
 
 def without_zarr(folder: Path) -> Path:
@@ -55,16 +59,16 @@ def test_a_part_that_hangs_is_stopped_and_keeps_what_it_has(tmp_path) -> None:
     """The result before the hang stays; a part for which no time is left says so."""
     script = tmp_path / "run.py"
     lines = SCRIPT.read_text().replace("parents[2]", f"parents[2] and Path({str(ROOT)!r})")
-    lines = lines.replace("    yield from measured_points(", HANGS)
-    lines = lines.replace("(points, 40.0)", "(points, 3.0)").replace(
+    lines = lines.replace("    random, batches =", HANGS)
+    lines = lines.replace("(head, 30.0)", "(head, 3.0)").replace(
         "(selftest, 150.0)", "(selftest, 0)"
     )
     script.write_text(lines)
-    words = [str(tmp_path), "--device", "cpu", "--quick", "--parts", "points,selftest"]
+    words = [str(tmp_path), "--device", "cpu", "--quick", "--parts", "head,selftest"]
     done = subprocess.run([sys.executable, str(script), *words], capture_output=True, check=False)
     assert done.returncode == 1
     figures = json.loads((tmp_path / "figures.json").read_text())
-    first, last = figures["points"]["figures"]
+    first, last = figures["head"]["figures"]
     assert first == {"done": 1}
     assert last["failed"] == "stopped after 3 seconds"
     assert "left out" in figures["selftest"]["figures"][0]["failed"]

@@ -88,7 +88,7 @@ def library_of(monkeypatch):
 
 
 def test_a_text_is_compiled_once_for_each_architecture(nvrtc, tmp_path) -> None:
-    """What was not kept after a trial is compiled again."""
+    """Code that was not kept after a trial is compiled again."""
     folder = tmp_path / "cache"
     code, file, new = compiled("a", 90, folder)
     assert (code, new) == (b"code of a", True)

@@ -383,7 +383,7 @@ class CudaProgram:
 
     @property
     def new(self) -> bool:
-        """As `Kernels` has it."""
+        """Whether the kernels are new, as `Kernels` has it."""
         return self._kernels.new
 
     def launch(self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[Any]) -> None:
