@@ -18,8 +18,8 @@ ROOTS = ("formats", "fhash_codec", "cli", "benchmarks", "tests")
 SLACK = 1.02
 """Factor by which a number of the table may stand above the house."""
 MODULES = {"product": 208, "tests": 225}
-"""Most modules in all, of the three packages of the product and of their tests; three of the product
-leave with the streamed march, when its heir has run on a device."""
+"""Most modules in all, of the three packages of the product and of their tests. Three of these
+packages leave with the streamed march, when its heir has run on a device."""
 
 
 def sizes(rooms: list[str]) -> tuple[Counter[str], Counter[str]]:

@@ -415,6 +415,7 @@ def encoded_on_cuda(tmp_path, monkeypatch, emulated):
 
     def encode(make=lambda device: emulated(), **changes):
         monkeypatch.setattr(torch.version, "cuda", "13.0")
+        monkeypatch.setattr("fhash_codec.devices.has_device", lambda: True)
         monkeypatch.setattr(FusedEngine, "__init__", on_cpu)
         monkeypatch.setattr(driver, "CudaDevice", make)
         values = np.add.outer(
