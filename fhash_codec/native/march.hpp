@@ -13,6 +13,13 @@
 #include <algorithm>
 #include <atomic>
 
+// FHASH_APART before a function that many places call, and seldom: compiled once.
+#if defined(_MSC_VER)
+#define FHASH_APART __declspec(noinline)
+#else
+#define FHASH_APART __attribute__((noinline))
+#endif
+
 // What is marched; march.cu has a structure in its place whose absent parts are constants.
 using FhashInput = FhashMarch;
 
@@ -110,15 +117,6 @@ struct FhashPoints {
     }
 };
 
-inline FhashCell network_cell(const FhashInput& m, double x, double y, double z, bool sloped) {
-    FhashPoints point;
-    point.add(x, y, z);
-    point.evaluate(m, sloped);
-    const float(&slopes)[4] = point.slopes[0];
-    if (!sloped) return {point.values[0], 0, 0, 0};
-    return {point.values[0], slopes[3], slopes[2], slopes[1]};
-}
-
 // The trilinear value at a place, clamped to the vertices, and its gradient per vertex. A vertex of
 // no weight need not have a value; where it has none, the gradient has none (NaN). values: z, y, x
 // of a shape.
@@ -152,17 +150,28 @@ inline FhashCell trilinear(const float* values, const std::int64_t* shape, doubl
     return {value, gx, gy, gz};
 }
 
-// The same of the frame's values, or of smoother ones; of a network where it has a value.
-inline FhashCell fhash_cell_in(const FhashInput& m, const float* values, double x, double y,
-                               double z, bool sloped = true) {
-    if (!m.network || values != m.values) return trilinear(values, m.shape, x, y, z);
+// The same of a network, where it has a value.
+FHASH_APART FhashCell cell_of_network(const FhashInput& m, double x, double y, double z,
+                                      bool sloped) {
     double at[3] = {x, y, z}, rates[3];
     for (int c = 0; c < 3; c++) at[c] = max(0.0, min(at[c], m.shape[2 - c] - 1.0));
     x = at[0]; y = at[1]; z = at[2];
     to_box(m, at, rates);
-    const double there = trilinear(values, m.network_shape, at[0], at[1], at[2]).value;
+    const double there = trilinear(m.values, m.network_shape, at[0], at[1], at[2]).value;
     if (!(there == there)) return {there, there, there, there};
-    return network_cell(m, x, y, z, sloped);
+    FhashPoints point;
+    point.add(x, y, z);
+    point.evaluate(m, sloped);
+    const float(&slopes)[4] = point.slopes[0];
+    if (!sloped) return {point.values[0], 0, 0, 0};
+    return {point.values[0], slopes[3], slopes[2], slopes[1]};
+}
+
+// The same of the frame's values, or of smoother ones.
+inline FhashCell fhash_cell_in(const FhashInput& m, const float* values, double x, double y,
+                               double z, bool sloped = true) {
+    if (m.network && values == m.values) return cell_of_network(m, x, y, z, sloped);
+    return trilinear(values, m.shape, x, y, z);
 }
 
 // The same for the values of the frame.

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from frame_field import CENTRAL, NETWORK_SCENES, SCENES, field_of
-from rarely import rarely
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
@@ -233,6 +232,10 @@ def test_both_ways_make_one_picture_of_a_network_near_that_of_its_vertices(
     assert np.mean(np.abs(streamed - cache)) < 0.02
 
 
+ON_DEVICE = ("between", "surfaces", "attenuated", "clipped")
+"""Scenes of a network that are always drawn by kernels; the others rarely."""
+
+
 def by_packets(
     volume: Volume, scene: dict[str, Any], task: Task, marcher: DeviceMarcher | None, path: int = 0
 ) -> Marched:
@@ -253,8 +256,20 @@ def assert_one_picture(here: Marched, there: Marched) -> None:
             np.testing.assert_allclose(mine, other, atol=2e-3)
 
 
-@pytest.mark.parametrize("path", [2, "kernels", *rarely(0, 1)])
-@pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
+@pytest.mark.parametrize(
+    ("scene", "path"),
+    [
+        pytest.param(
+            NETWORK_SCENES[name],
+            path,
+            id=f"{name}-{path}",
+            marks=[pytest.mark.every]
+            * (path in (0, 1) or (path, name in ON_DEVICE) == ("k", False)),
+        )
+        for name in NETWORK_SCENES
+        for path in (2, "k", 0, 1)
+    ],
+)
 def test_native_and_streamed_samples_of_a_network_make_one_picture(
     files: dict[str, Path],
     planned: Planned,
@@ -262,7 +277,7 @@ def test_native_and_streamed_samples_of_a_network_make_one_picture(
     path: int | str,
     request: pytest.FixtureRequest,
 ) -> None:
-    marcher = request.getfixturevalue("emulated_marcher") if path == "kernels" else None
+    marcher = request.getfixturevalue("emulated_marcher") if path == "k" else None
     with fhash_codec.open(files["paper"]) as volume:
         field, task = planned(volume, scene, NUMPY)
         assert isinstance(field, NetworkField)

@@ -138,6 +138,7 @@ inline int launch(
     }
     sigaction(SIGSEGV, &usual, nullptr);
     std::free(shared);
+    body = nullptr;  // its code may be gone with its library when the process ends
     return answer;
 }
 
