@@ -144,7 +144,7 @@ wheel/%: .venv/.clang
 	touch $@ .venv/.plain
 
 # Heavy tools, each by what brings it in beside what is there.
-PACKAGES_torch := 'fhash[torch]'
+PACKAGES_torch := 'fhash[cuda,torch]'
 PACKAGES_vtk := 'fhash-bench[vtk]'
 PACKAGES_docs := 'fhash[docs]'
 PACKAGES_clang := ziglang build

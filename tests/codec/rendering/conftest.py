@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pytest
 from emulated_cuda import EmulatedDevice
 from frame_field import blobs, by_stream, field_of, frame_of, table_of, task_of
+from rarely import rarely
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
@@ -41,7 +42,7 @@ def emulated_marcher(kernels_folder: Path) -> DeviceMarcher:
     return DeviceMarcher(EmulatedDevice(kernels_folder), threads=32)
 
 
-@pytest.fixture(params=["native", "streamed", "kernels"])
+@pytest.fixture(params=["native", "streamed", *rarely("kernels")])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """The marchers through a decoded frame: on the processor, streamed, and on a device."""
     place = "fhash_codec.rendering.march.march_native"

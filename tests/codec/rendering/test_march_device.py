@@ -33,7 +33,7 @@ from fhash_codec.rendering.march_device import (
 from fhash_codec.rendering.network_device import constants_of
 from fhash_formats.errors import FhashWarning, InputError
 
-FEW = ("plain", "surfaces", "between", "all light", "maximum")
+FEW = ("surfaces", "between", "maximum")
 """Scenes that go through most of what a device does with a file; the others rarely."""
 
 
