@@ -11,16 +11,16 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fhash_codec.cuda import device as cuda
 from fhash_codec.cuda.device import has_device
+from fhash_codec.cuda.nvrtc import Unavailable, loaded
 from fhash_codec.native.network import machine_paths
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
-from fhash_formats.native import ffi
 from fhash_formats.support.threads import at_most, usable_threads
 
 if TYPE_CHECKING:
@@ -96,25 +96,15 @@ Both take the same time at 2.4 to 4.0 s.
 """
 
 
-DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
-"""File name of the driver of CUDA."""
-
-
 def may_have_cuda() -> bool:
     """Return whether there are torch and CUDA's driver, without importing torch, which is slow."""
     if not has_torch():
         return False
     try:
-        _driver()
-    except OSError:
+        loaded(cuda.LIBRARIES)
+    except Unavailable:
         return False
     return True
-
-
-@cache
-def _driver() -> Any:
-    """Return the driver's library, which stays loaded; OSError where there is none."""
-    return ffi.dlopen(DRIVER)
 
 
 def has_torch() -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -313,9 +313,9 @@ def driver() -> Driver:
 
 
 @cache
-def first_device(make: Callable[[], Device] = CudaDevice) -> Device:
+def first_device() -> Device:
     """The first device, for all that ask; Unavailable where there is none."""
-    return make()
+    return CudaDevice()
 
 
 def has_device() -> bool:

@@ -245,6 +245,12 @@ def time_nodes(key_frames: int, resolution: int, key_index: float) -> tuple[rang
     return range(node, node + 1 if at == node else node + 2), at - node
 
 
+def nodes_of(network: Network, key_index: float) -> tuple[list[range], list[float]]:
+    """Return the time nodes of each level around a time, and the share of the second."""
+    found = [time_nodes(network.key_frames, level[0], key_index) for level in network.levels]
+    return [nodes for nodes, _ in found], [share for _, share in found]
+
+
 def corners_before(
     sizes: Sequence[int], resolution: Sequence[int], point: Sequence[float]
 ) -> list[int]:

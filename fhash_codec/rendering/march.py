@@ -151,7 +151,7 @@ class MarchInput:
                 **frame.network.fields,
                 "values": frame.network.mask,
                 "network_shape": frame.network.mask.shape,
-                "network_whole": not np.isnan(frame.network.mask).any(),
+                "network_whole": frame.network.whole,
                 "network_low": start,
                 "network_span": stop - start,
                 "network_status": np.zeros(1, np.int64),

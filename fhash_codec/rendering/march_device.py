@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -23,13 +23,13 @@ from fhash_codec.cuda.device import Device, Kernels, Memory, sent
 from fhash_codec.cuda.nvrtc import Unavailable
 from fhash_codec.native import ffi
 from fhash_codec.paper.engines import fused
+from fhash_codec.paper.model import nodes_of
 from fhash_codec.paper.network import Network
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.march_task import Marched
 from fhash_codec.rendering.network_device import (
     NetworkNodes,
     constants_of,
-    nodes_of,
     rows_of,
     spans_of,
 )
@@ -105,7 +105,7 @@ class _Copy:
     """A copy of an array on the device.
 
     Attributes:
-        of: the array, as long as it is.
+        of: the array; when it is gone, the copy is forgotten.
         memory: of the copy.
         decoded: blocks that were decoded when it was made, of a frame that is decoded bit by bit.
     """
@@ -138,13 +138,13 @@ class DeviceMarcher:
     def network(self, network: Network, key: float) -> DeviceNetwork:
         """A network at one time on the device; Unavailable for one that the kernels cannot do."""
         constants = constants_of(network)
-        last, nodes = self._nodes, nodes_of(network, key)[0]
+        last, (nodes, shares) = self._nodes, nodes_of(network, key)
         if last is None or last[0]() is not network or last[1].nodes != nodes:
             # Both may not fit, and a closed file leaves nothing on the device.
             self._nodes = last = None
             held = weakref.ref(network, self._forget)
             self._nodes = last = held, NetworkNodes(network, key, self.device)
-        return DeviceNetwork(self, network, key, last[1], constants)
+        return DeviceNetwork(self.device, network, last[1], shares, constants)
 
     def _forget(self, network: Callable[[], Network | None]) -> None:
         if self._nodes is not None and self._nodes[0] is network:
@@ -329,15 +329,15 @@ class DeviceNetwork:
 
     def __init__(
         self,
-        marcher: DeviceMarcher,
+        device: Device,
         network: Network,
-        key: float,
         nodes: NetworkNodes,
+        shares: Sequence[float],
         constants: Mapping[str, int],
     ) -> None:
-        """Take over the tables around the time."""
-        self.constants, self._nodes, self._device = constants, nodes, marcher.device
-        self._shares = nodes_of(network, key)[1]
+        """Take over the tables around the time; shares: of the second node of each level."""
+        self.constants, self._nodes, self._device = constants, nodes, device
+        self._shares = shares
         self._layers = sent(self._device, rows_of(network))
         self._spans = sent(self._device, spans_of(network))
         self._levels: tuple[Memory, list[Any]] | None = None

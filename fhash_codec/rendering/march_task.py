@@ -208,6 +208,7 @@ class NetworkValues:
         fields: of the marcher, that name the network's function and what it takes.
         low, high: values of the network's 0 and 1.
         mask: float32 (z, y, x), NaN at vertices of the network's box that have no value.
+        whole: whether there is none.
         held: what the fields point to.
         bounds: the box (3, 2), x, y, z, in drawn vertices, in which it has values, where its axes
             are uneven.
@@ -218,6 +219,7 @@ class NetworkValues:
     low: float
     high: float
     mask: Single
+    whole: bool
     held: Any = None
     bounds: Double | None = None
     device: Any = None

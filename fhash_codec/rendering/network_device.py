@@ -9,15 +9,12 @@ import numpy as np
 
 from fhash_codec.cuda.device import Device, Kernels, Memory, sent
 from fhash_codec.cuda.nvrtc import Unavailable
+from fhash_codec.paper.engines.fused import MAX_LAYERS, MAX_WIDTH
 from fhash_codec.paper.engines.fused.declarations import ffi
-from fhash_codec.paper.model import Patch, PointTables, SparsePatch, time_nodes
+from fhash_codec.paper.model import Patch, PointTables, SparsePatch, nodes_of
 from fhash_codec.paper.network import Network, Resolution
 from fhash_formats.support.values import Single
 
-MAX_WIDTH = 128
-"""Largest width of a hidden layer: a thread holds all of its values."""
-MAX_LAYERS = 2
-"""Largest number of hidden layers."""
 THREADS = 256
 """Threads of a block that mixes tables."""
 MIXED = 16
@@ -89,12 +86,6 @@ class NetworkNodes:
                 setattr(record, name, ffi.cast(ffi.typeof(getattr(record, name)), bits.address))
             record.nothing, record.strides, record.scale = self._facts[number]
         return sent(device, np.frombuffer(ffi.buffer(records), np.uint8)), held
-
-
-def nodes_of(network: Network, key: float) -> tuple[list[range], list[float]]:
-    """The time nodes of each level around a time, and the share of the second."""
-    found = [time_nodes(network.key_frames, level[0], key) for level in network.levels]
-    return [nodes for nodes, _ in found], [share for _, share in found]
 
 
 def _bits(patch: Patch, device: Device) -> dict[str, Memory]:

@@ -39,7 +39,8 @@ def network_frame(
     model = volume._model
     assert isinstance(model, PaperModel), "a plan marches through no other file"
     low, high = (float(end) for end in units.to(list(volume.value_range.ends)))
-    mask = np.where(volume.occupancy(step, volume.box), np.float32(1), np.float32(np.nan))
+    in_coreset = volume.occupancy(step, volume.box)
+    mask = np.where(in_coreset, np.float32(1), np.float32(np.nan))
     bricks = possible_bricks(mask, low, high)
     key = volume.key_times.key_index(step)
     on_device = None if device is None else device.network(model.network, key)
@@ -49,7 +50,13 @@ def network_frame(
         sampler = PointSampler(PointTables.of_box(model.network, key), key)
         fields = sampler.fields()
     network = NetworkValues(
-        fields=fields, low=low, high=high, mask=mask, held=sampler, device=on_device
+        fields=fields,
+        low=low,
+        high=high,
+        mask=mask,
+        whole=bool(in_coreset.all()),
+        held=sampler,
+        device=on_device,
     )
     frame = Frame(values=mask, first=volume.box.first, network=network)
     return (frame, bricks) if warp is None else _warped(frame, bricks, warp)
@@ -91,8 +98,8 @@ def _warped(frame: Frame, bricks: Bricks, warp: Warp) -> tuple[Frame, Bricks]:
         first.append(drawn.start)
         counts.append(len(drawn))
         begin, end = _touched(drawn, own, start, low.shape[2 - axis])
-        low = _extremes(low, begin, end, 2 - axis, np.minimum)
-        high = _extremes(high, begin, end, 2 - axis, np.maximum)
+        low = span_extremes(low, begin, end, 2 - axis, np.minimum)
+        high = span_extremes(high, begin, end, 2 - axis, np.maximum)
     network = replace(
         frame.network, fields={**frame.network.fields, **places}, bounds=np.array(bounds[::-1])
     )
@@ -123,7 +130,7 @@ def _touched(
     return begin, end
 
 
-def _extremes(
+def span_extremes(
     values: Single,
     begin: npt.NDArray[np.int64],
     end: npt.NDArray[np.int64],

@@ -654,11 +654,15 @@ def _surfaces(effects: Effects, function: TransferFunction, units: Units) -> tup
     )
 
 
+def _longest_ray(task: Task) -> float:
+    """Samples of a ray along the diagonal of the domain."""
+    grid = task.rays.grid
+    return float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
+
+
 def _check_ray_length(task: Task) -> None:
     """Warn of rays of more than LONG_RAY samples; raise InputError above MAX_RAY_SAMPLES."""
-    grid = task.rays.grid
-    diagonal = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing))
-    samples = diagonal / task.step
+    samples = _longest_ray(task)
     if not samples > LONG_RAY:
         return
     line = (
@@ -740,10 +744,8 @@ def _device(volume: Volume, scene: Scene, task: Task, pictures: int) -> tuple[st
     check_cuda(asked, torch=False)
     if asked == "cuda":
         return "cuda", "as the scene says"
-    grid = task.rays.grid
     width, height = task.rays.size
-    longest = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
-    samples = width * height * task.antialiasing**2 * longest / 2 * pictures
+    samples = width * height * task.antialiasing**2 * _longest_ray(task) / 2 * pictures
     rate = (NETWORK_SAMPLES if volume.profile == "paper" else SAMPLES) * usable_threads()
     seconds = samples / rate
     many = "" if pictures == 1 else f" for {pictures} pictures"

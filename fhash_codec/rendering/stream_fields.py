@@ -22,7 +22,7 @@ from fhash_codec.rendering.march_task import (
     Task,
     Units,
 )
-from fhash_codec.rendering.network_frame import possible_bricks
+from fhash_codec.rendering.network_frame import possible_bricks, span_extremes
 from fhash_codec.volume import Volume
 from fhash_formats.support.threads import usable_threads
 
@@ -313,8 +313,8 @@ class WarpedField:
         # Bricks of drawn cells have the extreme values of all bricks that they touch.
         for axis, number in ((0, 2), (1, 1), (2, 0)):
             begin, end = self._touched(number, SIDE, low.shape[axis], float(first[number]))
-            low = _extremes(low, begin, end, axis, np.minimum)
-            high = _extremes(high, begin, end, axis, np.maximum)
+            low = span_extremes(low, begin, end, axis, np.minimum)
+            high = span_extremes(high, begin, end, axis, np.maximum)
         self.bricks = replace(field.bricks, low=low, high=high)
 
     def _drawn(self, places: Array) -> Array:
@@ -353,7 +353,7 @@ class WarpedField:
         first = self.arrays.host(self._field.first)
         for axis, number in ((0, 2), (1, 1), (2, 0)):
             begin, end = self._touched(number, 1, seen.shape[axis], float(first[number]))
-            seen = _extremes(seen, begin, end, axis, np.logical_or)
+            seen = span_extremes(seen, begin, end, axis, np.logical_or)
         return self.arrays.array(seen)
 
     def values(self, places: Array, wanted: Array | None = None) -> Array:
@@ -383,17 +383,6 @@ class WarpedField:
             moved[:, axis] = low + (at - arrays.to_float64(before)) * rate
             rates[:, axis] = rate
         return moved, rates
-
-
-def _extremes(
-    values: np.ndarray, begin: np.ndarray, end: np.ndarray, axis: int, reduce: np.ufunc
-) -> np.ndarray:
-    """Reduce the spans `begin` to `end`, both included, of an axis."""
-    moved = np.moveaxis(values, axis, 0)
-    parts = [
-        reduce.reduce(moved[low : high + 1], axis=0) for low, high in zip(begin, end, strict=True)
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.stack(parts), 0, axis))
 
 
 ENDLESS = 2.0**62

@@ -38,7 +38,7 @@ from fhash_codec.paper.engines.parameters import (
     initial_parameters,
     used_numbers,
 )
-from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, time_nodes
+from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, nodes_of
 from fhash_codec.paper.network import Architecture, Network, Resolution, parameter_count
 from fhash_formats.errors import FhashWarning
 from fhash_formats.support.values import Single
@@ -434,12 +434,6 @@ class DeviceTables:
             values[0] if len(values) == 1 else torch.lerp(values[0], values[1], share)
             for values, share in zip(self._values, shares, strict=True)
         ]
-
-
-def nodes_of(network: Network, key: float) -> tuple[list[range], list[float]]:
-    """Return the time nodes of each level around a time, and the share of the second."""
-    found = [time_nodes(network.key_frames, level[0], key) for level in network.levels]
-    return [nodes for nodes, _ in found], [share for _, share in found]
 
 
 def _record(patch: Patch, resolution: Resolution, bits: Mapping[str, Tensor]) -> Any:
